@@ -1,0 +1,59 @@
+# Every run's environment, in one place.
+# One thread per rank: cells are shared out over ranks, and BLAS only sees tiny matrices.
+export OMP_NUM_THREADS := 1
+export OPENBLAS_NUM_THREADS := 1
+# Containers and CI are root, which Open MPI refuses, and have no network, about which it complains.
+export OMPI_ALLOW_RUN_AS_ROOT := 1
+export OMPI_ALLOW_RUN_AS_ROOT_CONFIRM := 1
+export OMPI_MCA_btl := ^tcp
+# Ranks that wait leave the core to those that work: tests run more ranks than there are cores.
+export OMPI_MCA_mpi_yield_when_idle := 1
+
+PYTHON := .venv/bin/python
+# --oversubscribe: also more ranks than cores; --bind-to none: several runs may share the machine.
+MPIRUN := mpirun --oversubscribe --bind-to none
+PYTEST := $(PYTHON) -m pytest
+# Ranks share one work tree, hence one pytest cache at most; a deadlock shows where it is.
+MPI_PYTEST := $(PYTEST) --color=no -p no:cacheprovider -o faulthandler_timeout=240
+# nproc obeys OMP_NUM_THREADS, which is 1 here.
+RANKS := $(shell n=$$(env -u OMP_NUM_THREADS nproc); echo $$((n < 2 ? n : 2)))
+
+.PHONY: help setup demo test verify test-debian13 lint clean
+
+help: ## this list
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+setup: ## install what is missing (Debian packages, .venv)
+	@tools/setup.sh
+
+demo: setup ## an impact, computed and drawn (results/impact)
+	$(MPIRUN) -n $(RANKS) .venv/bin/complexbody run demos/impact.py --out results/impact
+	@echo; echo "Pictures, and fields for ParaView:"
+	@find results/impact -name '*.png' -o -name '*.xdmf' -o -name '*.bp' | sort | sed 's/^/  /'
+
+# All three are run, whichever fails.
+test: setup ## all but the slow tests: serially, on 2 and on 3 ranks
+	@status=0; set -x; \
+	$(PYTEST) -m "not slow" || status=1; \
+	timeout -k 10 900 $(MPIRUN) -n 2 $(MPI_PYTEST) -m "not serial and not slow" || status=1; \
+	timeout -k 10 900 $(MPIRUN) -n 3 $(MPI_PYTEST) -m "not serial and not slow" || status=1; \
+	exit $$status
+
+verify: setup ## every test, slow ones too: serially and on 2 ranks
+	@status=0; set -x; \
+	$(PYTEST) || status=1; \
+	timeout -k 10 7200 $(MPIRUN) -n 2 $(MPI_PYTEST) -m "not serial" || status=1; \
+	exit $$status
+
+test-debian13: ## make test in a Debian 13 root (as root; ARGS="..." runs that instead)
+	@tools/test-debian13.sh $(if $(ARGS),"$(ARGS)")
+
+lint: setup ## ruff and mypy
+	@test -x .venv/bin/mypy -a -x .venv/bin/ruff || \
+	    $(PYTHON) -m pip install -q -c .venv/constraints.txt -e '.[dev]'
+	.venv/bin/ruff check .
+	.venv/bin/mypy
+
+clean: ## remove results and what the build made; keep .venv
+	rm -rf build results dist *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache
+	find . -path ./.venv -prune -o -name __pycache__ -type d -exec rm -rf {} +

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""complexbody: dynamics of complex bodies by variational integrators on FEniCSx.
+
+Materials whose points carry, besides the displacement u, a descriptor ν of their inner structure.
+Energies are written in UFL; forces, masses, dissipation and stable steps follow from them.
+After M. Focardi and P. M. Mariano, *Discrete dynamics of complex bodies with substructural
+dissipation: variational integrators and convergence* ("the paper" in docstrings).
+"""
+
+from complexbody.body import Body
+from complexbody.errors import ComplexBodyError
+from complexbody.histories import constant, ramp, ricker, sine, step, table
+from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.synchronous import Synchronous
+from complexbody.output import Output
+from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
+from complexbody.simulate import Result, simulate
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "AVI",
+    "Body",
+    "BodyForce",
+    "ComplexBodyError",
+    "Fix",
+    "Initial",
+    "Output",
+    "Pressure",
+    "Result",
+    "Scene",
+    "Synchronous",
+    "Traction",
+    "constant",
+    "ramp",
+    "ricker",
+    "simulate",
+    "sine",
+    "step",
+    "table",
+]

@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The one place that knows which dolfinx this is (0.5.2 to 0.11).
+
+Everything is probed with ``hasattr``; no other file may ask for a version.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem, jit, la, mesh, plot
+
+# dolfinx 0.5's JIT logs every compilation at level INFO through the root logger.
+for _handler in logging.getLogger().handlers:
+    _handler.setLevel(logging.WARNING)
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
+
+#: Options for every FFCx compilation: the flags matter more than who loops (measured).
+JIT_OPTIONS: dict[str, Any] = {
+    "cffi_extra_compile_args": ["-O3", "-march=native", "-fno-math-errno"],
+    "timeout": 120,
+}
+
+
+def equispaced(domain: mesh.Mesh) -> None:
+    """Give the mesh a coordinate element that FFCx will not rewrite.
+
+    FFCx 0.5 replaces the coordinate element at the first compilation, which changes the signature
+    of every later form: each rerun would compile one form more, and each rank for itself.
+    """
+    ufl_mesh = domain.ufl_domain()
+    element = ufl_mesh.ufl_coordinate_element()
+    if hasattr(ufl, "VectorElement") and getattr(element, "variant", lambda: "")() is None:
+        ufl_mesh._ufl_coordinate_element = ufl.VectorElement(
+            ufl.FiniteElement(
+                element.family(), element.cell(), element.degree(), variant="equispaced"
+            ),
+            dim=element.value_shape()[0],
+        )
+
+
+def vector_space(domain: mesh.Mesh, components: int) -> fem.FunctionSpace:
+    """Blocked continuous P1 space with values of shape (components,)."""
+    if hasattr(fem, "VectorFunctionSpace") and not hasattr(fem, "functionspace"):
+        return fem.VectorFunctionSpace(domain, ("Lagrange", 1), dim=components)
+    return fem.functionspace(domain, ("Lagrange", 1, (components,)))
+
+
+def cell_space(domain: mesh.Mesh, shape: tuple[int, ...] = ()) -> fem.FunctionSpace:
+    """Piecewise constant space with values of the given shape."""
+    if not hasattr(fem, "functionspace"):
+        if shape == ():
+            return fem.FunctionSpace(domain, ("DG", 0))
+        if len(shape) == 1:
+            return fem.VectorFunctionSpace(domain, ("DG", 0), dim=shape[0])
+        return fem.TensorFunctionSpace(domain, ("DG", 0), shape=shape)
+    return fem.functionspace(domain, ("DG", 0, shape) if shape else ("DG", 0))
+
+
+def _table(adjacency: Any, rows: int, columns: int) -> Ints:
+    """A dofmap as an int32 array of shape (rows, columns), from an AdjacencyList or an array."""
+    flat = adjacency.array if hasattr(adjacency, "array") else np.asarray(adjacency)
+    return np.asarray(flat, dtype=np.int32).reshape(rows, columns)
+
+
+def is_cellwise(function: fem.Function) -> bool:
+    """True for functions that are constant on each cell (DG0)."""
+    element = function.function_space.ufl_element()
+    degree = getattr(element, "embedded_superdegree", None)
+    return int(element.degree() if degree is None else degree) == 0
+
+
+def cell_count(domain: mesh.Mesh) -> tuple[int, int]:
+    """Owned cells and owned plus ghost cells of this rank."""
+    index_map = domain.topology.index_map(domain.topology.dim)
+    return index_map.size_local, index_map.size_local + index_map.num_ghosts
+
+
+def cell_nodes(domain: mesh.Mesh) -> Ints:
+    """Geometry nodes of each cell, ghosts last, shape (cells, vertices per cell)."""
+    return _table(domain.geometry.dofmap, cell_count(domain)[1], domain.topology.dim + 1)
+
+
+def cell_dofs(space: fem.FunctionSpace) -> Ints:
+    """Blocked degrees of freedom of each cell, shape (cells, dofs per cell)."""
+    return _table(space.dofmap.list, cell_count(space.mesh)[1], space.dofmap.dof_layout.num_dofs)
+
+
+def node_map(domain: mesh.Mesh) -> Any:
+    """Index map of the geometry nodes (owned first, then ghosts)."""
+    return domain.geometry.index_map()
+
+
+def node_count(domain: mesh.Mesh) -> int:
+    """Owned plus ghost geometry nodes of this rank."""
+    index_map = domain.geometry.index_map()
+    return int(index_map.size_local + index_map.num_ghosts)
+
+
+def original_cells(domain: mesh.Mesh) -> npt.NDArray[np.int64]:
+    """Number of each local cell in the input of the mesh: the same for every number of ranks."""
+    return np.asarray(domain.topology.original_cell_index, dtype=np.int64)
+
+
+def cell_name(domain: mesh.Mesh) -> str:
+    """'interval', 'triangle', 'tetrahedron', or whatever else the mesh is made of."""
+    cell = domain.ufl_domain().ufl_cell
+    return str((cell() if callable(cell) else cell).cellname())
+
+
+def geometry_degree(domain: mesh.Mesh) -> int:
+    """Polynomial degree of the mesh's geometry."""
+    cmap = domain.geometry
+    cmap = cmap.cmap if hasattr(cmap, "cmap") else cmap.cmaps[0]
+    return int(cmap.degree)
+
+
+def form(expression: Any) -> Any:
+    """Compile a UFL form (or a list of them) with the project's JIT options."""
+    if hasattr(jit, "ffcx_jit") and "jit_options" in fem.form.__code__.co_varnames:
+        return fem.form(expression, jit_options=JIT_OPTIONS)
+    return fem.form(expression, jit_params=JIT_OPTIONS)
+
+
+def expression(value: Any, space: fem.FunctionSpace) -> fem.Expression:
+    """A compiled UFL expression at the interpolation points of ``space``."""
+    points = space.element.interpolation_points
+    points = points() if callable(points) else points
+    try:
+        return fem.Expression(value, points, jit_options=JIT_OPTIONS)
+    except TypeError:
+        return fem.Expression(value, points, jit_params=JIT_OPTIONS)
+
+
+def evaluate(compiled: fem.Expression, domain: mesh.Mesh, cells: Ints) -> Array:
+    """Values of a compiled expression on cells, shape (cells, points × value size)."""
+    try:
+        values = np.asarray(compiled.eval(domain, cells))
+    except TypeError:  # up to 0.6 the expression knows its mesh
+        values = np.asarray(compiled.eval(cells))
+    return values.reshape(len(cells), int(np.prod(values.shape[1:])))  # also of no cells
+
+
+def integrals(compiled: Any, kind: int) -> list[tuple[int, Any]]:
+    """(subdomain id, ufcx integral) of a compiled form; kind 0 = cells, 1 = exterior facets.
+
+    A derivative that is identically zero compiles to a form without integrals: an empty list.
+    """
+    ufcx = compiled.ufcx_form
+    if hasattr(ufcx, "integral_ids"):
+        count = ufcx.num_integrals(kind)
+        ids, table = ufcx.integral_ids(kind), ufcx.integrals(kind)
+        return [(ids[i], table[i]) for i in range(count)]
+    first, last = ufcx.form_integral_offsets[kind], ufcx.form_integral_offsets[kind + 1]
+    return [(ufcx.form_integral_ids[i], ufcx.form_integrals[i]) for i in range(first, last)]
+
+
+def coefficient_positions(compiled: Any) -> list[int]:
+    """Position in the original UFL form of each coefficient that the kernel reads."""
+    ufcx = compiled.ufcx_form
+    if hasattr(ufcx, "original_coefficient_positions"):
+        return [ufcx.original_coefficient_positions[i] for i in range(ufcx.num_coefficients)]
+    return [ufcx.original_coefficient_position[i] for i in range(ufcx.num_coefficients)]
+
+
+def petsc_vector(function: fem.Function) -> Any:
+    """The PETSc Vec that shares the function's storage."""
+    return function.x.petsc_vec if hasattr(function.x, "petsc_vec") else function.vector
+
+
+def mesh_from_gmsh(model: Any, comm: Any, rank: int = 0, gdim: int = 3) -> tuple[Any, Any, Any]:
+    """Mesh, cell tags and facet tags of a gmsh model that ``rank`` holds; collective."""
+    # Not imported by dolfinx.io itself: it needs gmsh.
+    name = "gmsh" if find_spec("dolfinx.io.gmsh") else "gmshio"
+    module = import_module(f"dolfinx.io.{name}")
+    out = module.model_to_mesh(model, comm, rank, gdim=gdim)
+    if hasattr(out, "mesh"):
+        return out.mesh, out.cell_tags, out.facet_tags
+    return out[0], out[1], out[2]
+
+
+def create_mesh(comm: Any, cells: Any, points: Array, ufl_mesh: Any = None) -> mesh.Mesh:
+    """A simplicial mesh from global cells (int64) and points (float64) given by each rank."""
+    tdim = cells.shape[1] - 1
+    name = {1: "interval", 2: "triangle", 3: "tetrahedron"}[tdim]
+    gdim = points.shape[1]
+    if hasattr(ufl, "VectorElement"):
+        element = ufl.VectorElement(
+            ufl.FiniteElement("Lagrange", name, 1, variant="equispaced"), dim=gdim
+        )
+    else:
+        from basix.ufl import element as basix_element
+
+        element = basix_element("Lagrange", name, 1, shape=(gdim,))
+    domain = ufl.Mesh(element)
+    none = mesh.GhostMode.none
+    if "ghost_mode" in inspect.signature(mesh.create_mesh).parameters:  # 0.5
+        return mesh.create_mesh(comm, cells, points, domain, ghost_mode=none)
+    partitioner = mesh.create_cell_partitioner(none)
+    try:
+        return mesh.create_mesh(comm, cells, points, domain, partitioner=partitioner)
+    except TypeError:  # 0.10 moved the element before the points
+        return mesh.create_mesh(comm, cells, domain, points, partitioner=partitioner)
+
+
+def vtk_mesh(domain: mesh.Mesh) -> tuple[Any, Any, Any]:
+    """Topology, cell types and points of this rank's mesh, as pyvista takes them."""
+    maker = plot.vtk_mesh if hasattr(plot, "vtk_mesh") else plot.create_vtk_mesh
+    return maker(domain, domain.topology.dim)
+
+
+def exterior_facets(domain: mesh.Mesh) -> Ints:
+    """Owned facets on the boundary of the body."""
+    tdim = domain.topology.dim
+    domain.topology.create_connectivity(tdim - 1, tdim)
+    if tdim > 1:
+        return np.asarray(mesh.exterior_facet_indices(domain.topology), dtype=np.int32)
+    # Without ghost cells, 0.9 takes points between two ranks for the boundary of an interval.
+    domain.topology.create_connectivity(1, 0)
+    points, cells = domain.topology.index_map(0), cell_count(domain)[0]
+    ends = domain.topology.connectivity(1, 0).array[: 2 * cells]
+    touching = la.vector(points)
+    touching.array[:] = np.bincount(ends, minlength=len(touching.array))
+    mode = la.ScatterMode.add if hasattr(la, "ScatterMode") else la.InsertMode.add
+    touching.scatter_reverse(mode)
+    return np.flatnonzero(touching.array[: points.size_local] == 1).astype(np.int32)
+
+
+def accumulate(function: fem.Function) -> None:
+    """Add what ghosts hold to their owners, then give all copies the owners' values."""
+    mode = la.ScatterMode.add if hasattr(la, "ScatterMode") else la.InsertMode.add
+    function.x.scatter_reverse(mode)
+    function.x.scatter_forward()

@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+r"""The UFL side: the mixed (u, ν) action of a scene, its dissipation and its residuals.
+
+One blocked P1 space carries u and ν side by side (n = n_u + k components per node), so that a
+node's record in UFL, in FFCx kernels and in the time loops is the same. Knows no time stepping.
+
+    V(q)    = ∫ ρe(∇u, ν, ∇ν) + ρw(u, ν) dx − ∫_{∂B_t} t·u ds          (paper (potential))
+    r(q; v) = δV(q)[v], by ``ufl.derivative``
+    D(ν̇; φ) = ∫ ην̇·φ dx, with δ𝒜 − ∫D dt = 0 (paper (Foc-dissipation), its sign corrected)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from complexbody import _compat
+from complexbody.body import Body
+from complexbody.errors import BodyError, SceneError
+from complexbody.scene import BodyForce, Pressure, Scene, Traction
+
+
+def _columns(gradient: Any, rows: Sequence[int], dim: int) -> Any:
+    """Rows of a gradient as a (len(rows), 3) tensor; columns the mesh does not have are zero."""
+    return ufl.as_tensor(
+        [[gradient[i, j] if j < dim else ufl.as_ufl(0.0) for j in range(3)] for i in rows]
+    )
+
+
+def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a user's density and insist on a scalar UFL expression.
+
+    Raises:
+        BodyError: if it fails or returns something else.
+    """
+    try:
+        value = ufl.as_ufl(function(*arguments))
+    except BodyError:
+        raise
+    except Exception as error:
+        raise BodyError(
+            f"The {what} cannot be evaluated: {type(error).__name__}: {error}. Write it in UFL for "
+            "U of shape (n_u, 3), nu of shape (k,) and N of shape (k, 3)."
+        ) from error
+    if value.ufl_shape != () or value.ufl_free_indices:
+        free = ", with free indices" if value.ufl_free_indices else ""
+        raise BodyError(
+            f"The {what} has shape {value.ufl_shape}{free}, but a density is a scalar. Contract "
+            "its indices, for instance with ufl.inner."
+        )
+    return value
+
+
+class Action:
+    """Forms of one scene on its mixed P1 space.
+
+    Attributes:
+        space: Blocked P1 space of n = n_u + k components.
+        q: Function of (u, ν), where residuals are evaluated.
+        v: Test function.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.space = _compat.vector_space(scene.mesh, scene.components)
+        self.q = fem.Function(self.space, name="q")
+        self.v = ufl.TestFunction(self.space)
+        # Cell tags may be absent; a measure without them integrates everywhere.
+        data = {"subdomain_data": scene.cell_tags} if scene.cell_tags is not None else {}
+        self.dx = ufl.Measure("dx", domain=scene.mesh, **data)
+
+    def fields(self, q: Any) -> tuple[Any, Any, Any, Any]:
+        """(u, ν, U, N) of a mixed function: shapes (n_u,), (k,), (n_u, 3), (k, 3)."""
+        n_u, n, dim = self.scene.displacement, self.scene.components, self.scene.mesh.geometry.dim
+        u, nu = (ufl.as_vector([q[i] for i in r]) for r in (range(n_u), range(n_u, n)))
+        gradient = ufl.grad(q)
+        return (
+            u,
+            nu,
+            _columns(gradient, range(n_u), dim),
+            _columns(gradient, range(n_u, n), dim),
+        )
+
+    def stored_density(self, body: Body, q: Any) -> Any:
+        """ρe of the mixed function ``q`` [J/m³]."""
+        _, nu, U, N = self.fields(q)
+        return scalar(f"energy of {body.name}", body.energy, U, nu, N)
+
+    def potential_density(self, body: Body, q: Any) -> Any | None:
+        """ρw of the mixed function ``q`` [J/m³], or None where the body has no potential."""
+        if body.potential is None:
+            return None
+        u, nu, _, _ = self.fields(q)
+        return scalar(f"potential of {body.name}", body.potential, u, nu)
+
+    def measure(self, number: int) -> Any:
+        """The volume measure on region ``number``: one body may fill several regions."""
+        if isinstance(self.scene.body, Body):
+            measure = ufl.dx(domain=self.scene.mesh)
+        else:
+            measure = self.dx(sorted(self.scene.body)[number])
+        degree = self.scene.bodies[number].quadrature_degree
+        return measure if degree is None else measure(degree=degree)
+
+    def potential_energy(self, q: Any) -> Any:
+        """∫ρe + ρw dx as a UFL form (loads excluded: they depend on time)."""
+        total = 0
+        for number, body in enumerate(self.scene.bodies):
+            density = self.stored_density(body, q)
+            extra = self.potential_density(body, q)
+            total += (density if extra is None else density + extra) * self.measure(number)
+        return total
+
+    def residual(self) -> Any:
+        """δV(q)[v], the negative of the internal forces, as a UFL form."""
+        return ufl.derivative(self.potential_energy(self.q), self.q, self.v)
+
+    def jacobian(self) -> Any:
+        """δ²V(q)[v, dq], the tangent stiffness, as a UFL form."""
+        return ufl.derivative(self.residual(), self.q, ufl.TrialFunction(self.space))
+
+    def dissipation(self, rate: Any) -> Any:
+        """∫ην̇·φ dx as a UFL form: the virtual power δ𝒜 must balance."""
+        n_u, n = self.scene.displacement, self.scene.components
+        nu_dot = ufl.as_vector([rate[i] for i in range(n_u, n)])
+        phi = ufl.as_vector([self.v[i] for i in range(n_u, n)])
+        total = 0
+        for number, body in enumerate(self.scene.bodies):
+            eta = ufl.as_matrix(body.viscosity_matrix.tolist())
+            total += ufl.inner(ufl.dot(eta, nu_dot), phi) * self.measure(number)
+        return total
+
+    def kernel_form(self, density: Callable[[Any], Any], degree: int | None, rank: int) -> Any:
+        """∫density(q) dx over every cell (rank 0), its first (1) or second (2) derivative."""
+        measure = ufl.dx(domain=self.scene.mesh)
+        expression = density(self.q)
+        form = expression * (measure if degree is None else measure(degree=degree))
+        if rank > 0:
+            form = ufl.derivative(form, self.q, self.v)
+        if rank > 1:
+            form = ufl.derivative(form, self.q, ufl.TrialFunction(self.space))
+        return form
+
+    def stress_form(self, body: Body, values: bool) -> Any:
+        """∫σ·τ dx with τ constant on cells: the integral of a body's stresses over each cell.
+
+        Components are ∂(ρe)/∂(∂_j q_i) at i·d + j for directions j the mesh has, and, with
+        ``values``, the self-actions ∂(ρe + ρw)/∂q_i behind them.
+        """
+        scene, dim = self.scene, self.scene.mesh.geometry.dim
+        u, nu, U, N = (ufl.variable(field) for field in self.fields(self.q))
+        density = scalar(f"energy of {body.name}", body.energy, U, nu, N)
+        if body.potential is not None:
+            density += scalar(f"potential of {body.name}", body.potential, u, nu)
+        n_u, k = scene.displacement, scene.descriptor
+        P, S = ufl.diff(density, U), ufl.diff(density, N)
+        parts = [P[i, j] for i in range(n_u) for j in range(dim)]
+        parts += [S[i, j] for i in range(k) for j in range(dim)]
+        if values:
+            f, z = ufl.diff(density, u), ufl.diff(density, nu)
+            parts += [f[i] for i in range(n_u)] + [z[i] for i in range(k)]
+        tau = ufl.TestFunction(_compat.cell_space(scene.mesh, (len(parts),)))
+        degree = body.quadrature_degree
+        measure = ufl.dx(domain=scene.mesh)
+        total = sum(part * tau[i] for i, part in enumerate(parts))
+        return total * (measure if degree is None else measure(degree=degree))
+
+    def load_form(self, load: Traction | Pressure | BodyForce, facet_tags: Any, tag: int) -> Any:
+        """∫t·v ds or ∫b·v dx of a load with factor 1 as a UFL form.
+
+        Args:
+            load: The load.
+            facet_tags: MeshTags in which ``tag`` marks the loaded facets (surface loads).
+            tag: That tag.
+        """
+        scene = self.scene
+        if isinstance(load, BodyForce):
+            if load.where is None:
+                measure = ufl.dx(domain=scene.mesh)
+            else:
+                measure = self.dx(tuple(int(t) for t in np.atleast_1d(np.asarray(load.where))))
+        else:
+            measure = ufl.Measure("ds", domain=scene.mesh, subdomain_data=facet_tags)(tag)
+        name = "u" if isinstance(load, Pressure) else load.field
+        rows = scene.components_of(name)
+        v = ufl.as_vector([self.v[int(i)] for i in rows])
+        if isinstance(load, Pressure):
+            normal, dim = ufl.FacetNormal(scene.mesh), scene.mesh.geometry.dim
+            p = float(load.pressure)
+            if not np.isfinite(p):
+                raise SceneError(f"Pressure: pressure is {p}. Give a finite number in Pa.")
+            # A Constant, so that the form compiles once for all values.
+            pressure = fem.Constant(scene.mesh, p)
+            vector = ufl.as_vector(
+                [-pressure * normal[i] if i < dim else 0.0 for i in range(len(rows))]
+            )
+        else:
+            vector = self._vector(load.vector, len(rows), type(load).__name__)
+        return ufl.inner(vector, v) * measure
+
+    def _vector(self, value: Any, count: int, what: str) -> Any:
+        if callable(value):
+            function = fem.Function(_compat.vector_space(self.scene.mesh, count))
+            function.interpolate(lambda x: np.asarray(value(x), dtype=float).reshape(count, -1))
+            return function
+        numbers = np.atleast_1d(np.asarray(value, dtype=np.float64))
+        if numbers.shape != (count,) or not np.all(np.isfinite(numbers)):
+            raise SceneError(
+                f"{what}: vector {value!r} does not have {count} finite components. Give one "
+                "number per component of the field."
+            )
+        return fem.Constant(self.scene.mesh, numbers)

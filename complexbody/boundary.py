@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Supports, loads and initial data as nodal arrays of a scene.
+
+Here predicates and tags become nodes, prescribed values become targets, and loads become vectors
+assembled once, each with a history. Knows no time step.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+
+from complexbody import _compat
+from complexbody.action import Action
+from complexbody.errors import SceneError, agree
+from complexbody.histories import Constant, History
+from complexbody.scene import FIELDS, BodyForce, Fix, Scene
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[Any]  # int32 from dolfinx, int64 from numpy
+
+
+@dataclass
+class Supports:
+    """Prescribed components of this rank's geometry nodes.
+
+    Attributes:
+        fixed: True where a component is prescribed, shape (geometry nodes, n).
+        value: Prescribed value at factor 1, same shape.
+        history: Index into ``histories`` per entry, same shape (0 where not prescribed).
+        histories: The histories; index 0 is constant.
+    """
+
+    fixed: npt.NDArray[np.bool_]
+    value: Array
+    history: npt.NDArray[np.int32]
+    histories: list[History]
+
+    @property
+    def moving(self) -> npt.NDArray[np.bool_]:
+        """True where a prescribed component depends on time."""
+        return self.fixed & (self.history > 0)
+
+    def targets(self, rows: Any, columns: Any, t: float) -> Array:
+        """Prescribed values of entries (rows, columns) at time t [s]."""
+        factors = np.array([float(h(t)) for h in self.histories])
+        return self.value[rows, columns] * factors[self.history[rows, columns]]
+
+
+def entities(scene: Scene, thing: Any) -> Ints | None:
+    """Facets of this rank that a support or surface load names; None for a node predicate.
+
+    Collective.
+
+    Raises:
+        SceneError: if a predicate of facets fails (on all ranks).
+    """
+    mesh, where = scene.mesh, thing.where
+    exterior = _compat.exterior_facets(mesh)
+    if isinstance(where, str):
+        return exterior
+    if callable(where):
+        if isinstance(thing, Fix):
+            return None
+        errors: list[Exception | None] = [None]
+
+        def marker(x: Array) -> Any:
+            mask, error = _mask(type(thing).__name__, where, x)
+            errors.append(error)
+            return mask
+
+        found = dmesh.locate_entities_boundary(mesh, mesh.topology.dim - 1, marker)
+        agree(mesh.comm, next((e for e in errors if e is not None), None))
+        return np.intersect1d(found, exterior)
+    tags = np.atleast_1d(np.asarray(where))
+    facets = scene.facet_tags.indices[np.isin(scene.facet_tags.values, tags)]
+    return facets if isinstance(thing, Fix) else np.intersect1d(facets, exterior)
+
+
+def _mask(what: str, where: Any, x: Array) -> tuple[npt.NDArray[np.bool_], Exception | None]:
+    """Where a user's predicate holds at points x (3, npts); nowhere if it fails, and why."""
+    none = np.zeros(x.shape[1], np.bool_)
+    if not x.shape[1]:
+        return none, None  # ranks without points have nothing to ask
+    try:
+        mask = np.asarray(where(x))
+    except Exception as found:  # a user's callable may fail in any way
+        return none, SceneError(
+            f"{what}: the predicate cannot be evaluated: {type(found).__name__}: {found}. Give a "
+            "function of x (3, npts) -> bool (npts,)."
+        )
+    if mask.shape != none.shape:
+        return none, SceneError(
+            f"{what}: the predicate returned shape {mask.shape} for {x.shape[1]} points. Return "
+            "one truth value per column of x."
+        )
+    return mask.astype(np.bool_), None
+
+
+def supports(scene: Scene, action: Action) -> Supports:
+    """Resolve the supports of a scene; collective.
+
+    Raises:
+        SceneError: if a support selects nothing, has the wrong number of components, or clashes
+            with another one (on all ranks).
+    """
+    mesh, comm = scene.mesh, scene.mesh.comm
+    x = np.asarray(mesh.geometry.x)
+    shape = (len(x), scene.components)
+    out = Supports(np.zeros(shape, bool), np.zeros(shape), np.zeros(shape, np.int32), [Constant()])
+    error: Exception | None = None
+    for fix in scene.supports:
+        facets = entities(scene, fix)
+        if facets is None:
+            mask, problem = _mask(f"Fix({fix.field!r})", fix.where, x.T)
+            agree(comm, problem)
+            nodes = np.flatnonzero(mask)
+        else:
+            dim = mesh.topology.dim - 1
+            mesh.topology.create_connectivity(dim, dim + 1)
+            nodes = np.asarray(fem.locate_dofs_topological(action.space, dim, facets))
+        if comm.allreduce(len(nodes)) == 0 and error is None:
+            error = SceneError(
+                f"Fix({fix.field!r}, where={fix.where!r}) selects no node. Check the predicate's "
+                "tolerance or the tag."
+            )
+        error = error or _prescribe(scene, out, fix, nodes, x)
+    agree(comm, error)
+    return out
+
+
+def _prescribe(scene: Scene, out: Supports, fix: Fix, nodes: Any, x: Any) -> Exception | None:
+    all_components = scene.components_of(fix.field)
+    chosen = np.arange(len(all_components))
+    if fix.components is not None:
+        chosen = np.atleast_1d(np.asarray(fix.components))
+        if not np.all(np.isin(chosen, np.arange(len(all_components)))) or chosen.size == 0:
+            return SceneError(
+                f"Fix({fix.field!r}): components {fix.components} do not exist; the field has "
+                f"{len(all_components)}, counted from 0. Give some of those."
+            )
+    chosen = chosen.astype(np.int64)
+    try:
+        values = _values(fix.value, x[nodes], len(chosen))
+    except Exception as found:  # a user's callable may fail in any way
+        return SceneError(
+            f"Fix({fix.field!r}): value cannot be evaluated: {type(found).__name__}: {found}. Give "
+            "numbers, or a callable of x (3, npts) -> (components, npts)."
+        )
+    if values is None:
+        return SceneError(
+            f"Fix({fix.field!r}): value {fix.value!r} does not give {len(chosen)} finite "
+            "component(s). Give one number per prescribed component, or a callable of x."
+        )
+    number = 0
+    if not isinstance(fix.history, Constant):
+        if fix.history not in out.histories:
+            out.histories.append(fix.history)
+        number = out.histories.index(fix.history)
+    rows, columns = nodes[:, None], all_components[chosen][None, :]
+    before = out.fixed[rows, columns]
+    scale = max(np.abs(values).max(initial=0.0), np.abs(out.value).max(initial=0.0), 1e-300)
+    differs = np.abs(out.value[rows, columns] - values) > 1e-12 * scale
+    differs |= out.history[rows, columns] != number
+    if np.any(before & differs):
+        at = x[nodes[np.flatnonzero((before & differs).any(axis=1))[0]]]
+        return SceneError(
+            f"Two supports of {fix.field!r} prescribe different values at {at.tolist()}. Let them "
+            "not overlap, or give them the same value there."
+        )
+    out.fixed[rows, columns] = True
+    out.value[rows, columns] = values
+    out.history[rows, columns] = number
+    return None
+
+
+def _values(value: Any, points: Array, count: int) -> Array | None:
+    """Values (points, count) of a number, a sequence or a callable of x; None if they misfit."""
+    if not len(points):
+        return np.zeros((0, count))  # ranks without points have nothing to ask
+    try:
+        if callable(value):
+            given = np.asarray(value(points.T), dtype=np.float64)
+            given = np.broadcast_to(np.atleast_2d(given), (count, len(points))).T
+        else:
+            given = np.broadcast_to(np.asarray(value, dtype=np.float64), (len(points), count))
+    except (TypeError, ValueError):
+        return None
+    return given if np.all(np.isfinite(given)) else None
+
+
+@dataclass
+class Loads:
+    """Partial load vectors of this rank: entry i adds ``factor[group[i]]·value[i]`` at its node.
+
+    Attributes:
+        node: Geometry node of each entry.
+        component: Component within the record.
+        group: Index into ``histories``.
+        value: Force at factor 1 [N, or its partner on ν].
+        histories: One per group.
+    """
+
+    node: Ints
+    component: Ints
+    group: npt.NDArray[np.int32]
+    value: Array
+    histories: list[History]
+
+    def amplitudes(self, times: Array) -> Array:
+        """Factors at the times [s], shape (times, groups)."""
+        out = np.ones((len(times), max(len(self.histories), 1)))
+        for i, history in enumerate(self.histories):
+            out[:, i] = np.asarray(history(times), dtype=np.float64)
+        return out
+
+
+def loads(scene: Scene, action: Action) -> Loads:
+    """Assemble the loads of a scene by dolfinx, one vector each, before any halo sum; collective.
+
+    Raises:
+        SceneError: if a load selects nothing or its vector misfits (on all ranks).
+    """
+    comm, mesh = scene.mesh.comm, scene.mesh
+    rows: list[tuple[Any, ...]] = []
+    histories: list[History] = []
+    for load in scene.loads:
+        tags = None
+        if not isinstance(load, BodyForce):
+            facets = np.sort(entities(scene, load)).astype(np.int32)  # type: ignore[arg-type]
+            if comm.allreduce(len(facets)) == 0:
+                raise SceneError(
+                    f"{type(load).__name__}(where={load.where!r}) selects no boundary facet. Check "
+                    "the predicate's tolerance or the tag."
+                )
+            ones = np.full(len(facets), 1, dtype=np.int32)
+            tags = dmesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
+        error: Exception | None = None
+        form = None
+        try:
+            form = action.load_form(load, tags, 1)
+        except SceneError as found:
+            error = found
+        except Exception as found:  # a user's callable may fail in any way
+            error = SceneError(
+                f"{type(load).__name__}: vector cannot be evaluated: {type(found).__name__}: "
+                f"{found}. Give numbers, or a callable of x (3, npts) -> (components, npts)."
+            )
+        agree(comm, error)
+        vector = np.zeros(_compat.node_count(mesh) * scene.components)
+        fem.assemble_vector(vector, _compat.form(form))
+        if not np.all(np.isfinite(vector)):
+            error = SceneError(
+                f"{type(load).__name__}: the load is not finite everywhere. Check its vector or "
+                "pressure."
+            )
+        agree(comm, error)
+        entry = np.flatnonzero(vector)
+        if load.history not in histories:
+            histories.append(load.history)
+        group = np.full(len(entry), histories.index(load.history), np.int32)
+        rows.append((entry // scene.components, entry % scene.components, group, vector[entry]))
+    if not rows:
+        empty = np.zeros(0, np.int64)
+        return Loads(empty, empty, empty.astype(np.int32), np.zeros(0), [])
+    node, component, group, value = (np.concatenate(c) for c in zip(*rows, strict=True))
+    return Loads(node.astype(np.int64), component.astype(np.int64), group, value, histories)
+
+
+def initial(scene: Scene, action: Action) -> tuple[Array, Array]:
+    """Initial fields and rates over geometry nodes, shapes (geometry nodes, n); collective.
+
+    Raises:
+        SceneError: if an initial field has the wrong shape or non-finite values (on all ranks).
+    """
+    x = np.asarray(scene.mesh.geometry.x)
+    fields = np.zeros((len(x), scene.components))
+    rates = np.zeros_like(fields)
+    error: Exception | None = None
+    for target, suffix in ((fields, ""), (rates, "_dot")):
+        for name in FIELDS:
+            value = getattr(scene.initial, name + suffix)
+            if value is None:
+                continue
+            columns = scene.components_of(name)
+            if hasattr(value, "function_space"):
+                array = np.asarray(value.x.array)
+                fits = array.size == len(x) * len(columns) and np.all(np.isfinite(array))
+                given = array.reshape(len(x), len(columns)) if fits else None
+            else:
+                try:
+                    given = _values(value, x, len(columns))
+                except Exception as found:  # a user's callable may fail in any way
+                    given, error = (
+                        None,
+                        error
+                        or SceneError(
+                            f"Initial: {name}{suffix} cannot be evaluated: {type(found).__name__}: "
+                            f"{found}. Give a callable of x (3, npts)."
+                        ),
+                    )
+            if given is None:
+                error = error or SceneError(
+                    f"Initial: {name}{suffix} does not give {len(columns)} finite component(s) at "
+                    "every node. Give numbers, or a callable of x (3, npts) -> (components, npts)."
+                )
+            else:
+                target[:, columns] = given
+    agree(scene.mesh.comm, error)
+    return fields, rates

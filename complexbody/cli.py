@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The command line: reads what the user wants, and sees that all ranks end alike.
+
+What the commands do stands in :mod:`complexbody.commands`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+import textwrap
+import traceback
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+from mpi4py import MPI
+
+from complexbody import __version__, commands
+from complexbody.errors import CommandError, ComplexBodyError
+from complexbody.masses import SCHEMES
+from complexbody.output import CELL_FIELDS, NODE_FIELDS
+from complexbody.together import (
+    GRACE,
+    Elsewhere,
+    Interrupted,
+    abort,
+    arrive,
+    is_copy,
+    say,
+    signals,
+    together,
+)
+
+_EPILOG = """\
+examples:
+  complexbody check demos/impact.py               what would it do, and how long would it take?
+  complexbody run demos/impact.py                 as the file says
+  complexbody run demos/impact.py --set cells=80 --until 2e-5 --out results/fine
+  mpirun -n 4 complexbody run demos/impact.py     the same on four processes
+  complexbody info                                versions, compiler, what is missing
+
+a scene file is a Python file with
+  import complexbody as cb
+  def scene(comm, cells=40):                      parameters are set by --set cells=80
+      return cb.Scene(mesh, body, supports=…, loads=…, initial=…)
+and, if it likes,
+  DEFAULTS = dict(until=1e-5, every=1e-7)         what the options of run override
+  def check(result): ...                          raises AssertionError if the physics is wrong
+  def picture(result, path): ...                  draws into the file path
+
+exit codes:
+  0  done                          4    the run diverged
+  1  a bug of complexbody          5    the scene file's check failed
+  2  wrong input: what and where   130  stopped by Ctrl-C
+  3  something is not installed    143  stopped by SIGTERM
+"""
+_RUN_EPILOG = """\
+Options that are not given are taken from DEFAULTS of the scene file, then as shown here. Results go
+to DIR: run.json (what was run, and how it ended), ledger.csv, FIELD.xdmf with FIELD.h5 (open the
+.xdmf in ParaView), probe-NAME.csv and picture.png.
+
+examples:
+  complexbody run demos/impact.py --set refine=1.5 --every 1e-7 --out results/fine
+  complexbody run demos/impact.py --dissipation forward --start one-sided
+  complexbody run demos/impact.py --fields u,stress --probe tip=1,0.5,0 --no-picture
+  mpirun -n 4 complexbody run demos/impact.py
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Raises CommandError instead of leaving; help is printed by rank 0 only."""
+
+    def error(self, message: str) -> NoReturn:
+        raise CommandError(f"{message}. See {self.prog} --help.")
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        say(MPI.COMM_WORLD, message.rstrip("\n"), stream=file)
+
+
+def _wide(prog: str) -> argparse.RawDescriptionHelpFormatter:
+    return argparse.RawDescriptionHelpFormatter(prog, max_help_position=26, width=100)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of the command line."""
+    main = _Parser(
+        prog="complexbody",
+        description="Dynamics of complex bodies by variational integrators, on FEniCSx.",
+        epilog=_EPILOG,
+        formatter_class=_wide,
+        allow_abbrev=False,
+    )
+    main.add_argument("--version", action="version", version=f"complexbody {__version__}")
+    sub = main.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def command(name: str, function: Any, text: str, epilog: str = "") -> argparse.ArgumentParser:
+        made = sub.add_parser(
+            name, help=text, description=textwrap.fill(text[0].upper() + text[1:] + ".", 100),
+            epilog=epilog, formatter_class=_wide, allow_abbrev=False,
+        )  # fmt: skip
+        made.set_defaults(function=function)
+        made.add_argument("--debug", action="store_true", help="show tracebacks of errors")
+        return made
+
+    run = command("run", commands.run, "run a scene file", _RUN_EPILOG)
+    _scene(run)
+    _integrator(run)
+    _output(run)
+    check = command(
+        "check", commands.check,
+        "build everything without running, and say what run would do: is the energy coercive, "
+        "which cells limit the step, how many steps, how long",
+    )  # fmt: skip
+    _scene(check)
+    _integrator(check)
+    command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
+    return main
+
+
+def _scene(to: argparse.ArgumentParser) -> None:
+    to.add_argument("file", metavar="FILE", help="a scene file (see complexbody --help)")
+    group = to.add_argument_group("scene")
+    group.add_argument(
+        "--set", metavar="NAME=VALUE", action="append", default=[],
+        help="a parameter of the file's scene(), a Python literal or a string; repeatable",
+    )  # fmt: skip
+    group.add_argument("--until", metavar="T", type=float, help="end of the run [s]")
+
+
+def _integrator(to: argparse.ArgumentParser) -> None:
+    group = to.add_argument_group("integrator")
+    names = tuple(commands.INTEGRATORS)
+    group.add_argument("--integrator", choices=names, help=f"default {names[0]}")
+    group.add_argument(
+        "--step", metavar="H", type=float, help="step [s]; default: safety times the critical step"
+    )
+    group.add_argument(
+        "--safety",
+        metavar="S",
+        type=float,
+        help="fraction of the critical step; default 0.9 (synchronous), 0.45 (avi)",
+    )
+    group.add_argument(
+        "--dissipation", choices=SCHEMES, help="how viscosity is stepped; default exact"
+    )
+    group.add_argument(
+        "--start", choices=("trapezoidal", "one-sided"),
+        help="first kick: half (second order, default) or whole (the paper's, first order)",
+    )  # fmt: skip
+    group.add_argument(
+        "--critical", choices=("cells", "global"),
+        help="critical step by a bound of every cell (default) or of the whole body (SLEPc)",
+    )  # fmt: skip
+    group.add_argument(
+        "--balanced", action=argparse.BooleanOptionalAction, default=None,
+        help="avi: act against a smooth reference stress (default), or plainly",
+    )  # fmt: skip
+    group.add_argument(
+        "--passes", metavar="N", type=int, help="avi: smoothing passes of the reference; default 2"
+    )
+    group.add_argument(
+        "--filter", metavar="E", type=float, help="avi: strength of the rates' filter; default 0.01"
+    )
+    group.add_argument(
+        "--unstable-ok", action="store_true", default=None,
+        help="allow a step above the critical one, and energy that grows",
+    )  # fmt: skip
+
+
+def _output(to: argparse.ArgumentParser) -> None:
+    group = to.add_argument_group("output")
+    group.add_argument(
+        "--out", metavar="DIR", help="folder of the results; default results/NAME of the file"
+    )
+    group.add_argument(
+        "--every", metavar="DT", type=float,
+        help="time between fields [s]; default: at the start and the end",
+    )  # fmt: skip
+    group.add_argument(
+        "--fields", metavar="NAMES",
+        help=f"of {', '.join((*NODE_FIELDS, *CELL_FIELDS))}, separated by commas, or none; "
+        f"default {','.join(NODE_FIELDS)}",
+    )  # fmt: skip
+    group.add_argument(
+        "--probe", metavar="NAME=X,Y,Z", action="append", default=[],
+        help="a point whose fields go to a table; repeatable",
+    )  # fmt: skip
+    group.add_argument(
+        "--probe-steps", metavar="N", type=int, help="steps between its rows; default 10"
+    )
+    group.add_argument(
+        "--ledger-steps",
+        metavar="N",
+        type=int,
+        help="steps between ledger rows; default: a few per cent of the run, at least 100 rows",
+    )
+    group.add_argument("--no-picture", action="store_true", help="do not draw")
+    group.add_argument("--quiet", action="store_true", help="print only warnings and errors")
+
+
+@contextmanager
+def _warnings(comm: Any) -> Iterator[None]:
+    """Show warnings as one line each, on rank 0."""
+    before = warnings.showwarning
+
+    def show(message: Any, category: Any, *where: Any, **more: Any) -> None:
+        say(comm, f"complexbody: warning: {message}", stream=sys.stderr)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
+
+
+def _as_options(message: str) -> str:
+    """A message to someone who calls functions, for someone who gives options."""
+    for argument in ("unstable_ok=True", "growth=None"):
+        message = message.replace(argument, "--unstable-ok")
+    return message
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; collective.
+
+    Args:
+        argv: Arguments; those of the process by default.
+
+    Returns:
+        The exit code, the same on all ranks.
+    """
+    words = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    # PETSc's handler makes a crash of a reader that has left ("complexbody … | head").
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    comm = MPI.COMM_WORLD
+    # Apart from messages of scenes and simulations, which an error may cut off.
+    ranks, last = comm.Dup(), comm.Dup()
+    code, debug = 0, "--debug" in words
+    try:
+        with signals(ranks), _warnings(comm), together(ranks):
+            arguments = parser().parse_args(words)
+            arguments.words = words
+            arguments.function(arguments, ranks)
+    except SystemExit as end:  # --help and --version
+        code = int(end.code or 0)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except Elsewhere:  # shown by the rank that met it
+        code = 1
+    except ComplexBodyError as error:
+        if debug and not is_copy(error):
+            traceback.print_exception(error)
+        say(comm, f"complexbody: error: {_as_options(str(error))}", stream=sys.stderr)
+        code = error.exit_code
+    except Interrupted as stop:
+        say(comm, f"complexbody: {stop}", stream=sys.stderr)
+        code = stop.exit_code
+    except Exception as error:
+        traceback.print_exception(error)
+        where = f" on rank {comm.rank}" if comm.size > 1 else ""
+        told = f"complexbody: bug{where}: {type(error).__name__}: {error}. Please report it."
+        print(told, file=sys.stderr, flush=True)
+        code = 1
+    # Together: with a failure, mpirun stops all as soon as one has left.
+    if not arrive(last, GRACE if code else None):
+        abort(last, code, f"rank {comm.rank} has ended ({code}), others have not: all are stopped.")
+    ranks.Free()
+    last.Free()
+    return code

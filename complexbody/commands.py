@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What the commands of the command line do: run, check, info.
+
+Each takes the parsed arguments and a communicator of all ranks for :func:`together` alone. All are
+collective; every stage ends on all ranks together, so that none goes on without the others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import math
+import shlex
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from complexbody import machine, precheck, report
+from complexbody.errors import CommandError, MissingPackage
+from complexbody.files import on_first_rank
+from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.synchronous import Synchronous
+from complexbody.ledger import Bookkeeper
+from complexbody.output import NODE_FIELDS, Output, Probes
+from complexbody.problem import Problem
+from complexbody.rendering import require_vtk
+from complexbody.scene import Scene
+from complexbody.scenefile import CheckFailed, SceneFile, assignments, points
+from complexbody.simulate import Result, Simulation, default_ledger_steps
+from complexbody.together import Interrupted, say, together
+
+#: Integrators by the name that --integrator takes; the first is the default.
+INTEGRATORS = {"synchronous": Synchronous, "avi": AVI}
+_OPTIONS = (
+    "step", "safety", "dissipation", "start", "critical", "unstable_ok", "balanced",
+    "passes", "filter",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the command line and the scene file's DEFAULTS ask for together."""
+
+    file: SceneFile
+    scene: Scene
+    parameters: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    name: str
+    method: Any
+
+    @property
+    def until(self) -> float | None:
+        """End of the run [s], if anything gives it."""
+        return self.settings.get("until")
+
+    @property
+    def ledger_steps(self) -> int | None:
+        """Steps between ledger rows."""
+        return self.settings.get("ledger_steps")
+
+    def output(self) -> Output:
+        """What to write, and where.
+
+        Raises:
+            OutputError, SceneError: for what makes no sense.
+        """
+        s = self.settings
+        return Output(
+            s.get("out", Path("results") / self.file.path.stem),
+            every=s.get("every"),
+            times=s.get("times", ()),
+            fields=s.get("fields", NODE_FIELDS),
+            probes=s.get("probes", {}),
+            probe_steps=s.get("probe_steps", 10),
+        )
+
+
+def _job(a: argparse.Namespace, ranks: Any) -> Job:
+    """Read the scene file, make its scene and the integrator; collective."""
+    with together(ranks):
+        file = SceneFile(a.file)
+        parameters = file.complete(assignments(a.set))
+        settings = _settings(a, file)
+        name, method = _method(settings)
+    with together(ranks):
+        # Scenes may change what they are given.
+        scene = file.scene(MPI.COMM_WORLD, dict(parameters))
+    return Job(file, scene, parameters, settings, name, method)
+
+
+def _settings(a: argparse.Namespace, file: SceneFile) -> dict[str, Any]:
+    """DEFAULTS, overridden by the options that are given."""
+    settings = dict(file.defaults)
+    given = vars(a)
+    names = ("until", "every", "fields", "probe_steps", "ledger_steps", "out", "integrator")
+    for name in (*names, *_OPTIONS):
+        if given.get(name) is not None:
+            settings[name] = given[name]
+    if given.get("every") is not None:
+        settings.pop("times", None)
+    if isinstance(settings.get("fields"), str):
+        listed = [name.strip() for name in settings["fields"].split(",") if name.strip()]
+        settings["fields"] = () if listed == ["none"] else tuple(listed)
+    rows = settings.get("ledger_steps", 1)
+    if not isinstance(rows, int) or rows < 1:
+        raise CommandError(f"ledger_steps is {rows!r}. Give a whole number from 1.")
+    if given.get("probe"):
+        settings["probes"] = {**settings.get("probes", {}), **points(given["probe"])}
+    return settings
+
+
+def _method(settings: Mapping[str, Any]) -> tuple[str, Any]:
+    """The integrator with its options.
+
+    Raises:
+        CommandError: for a name or an option it does not have.
+        IntegratorError: for values it does not take.
+    """
+    name = settings.get("integrator", next(iter(INTEGRATORS)))
+    if name not in INTEGRATORS:
+        raise CommandError(f"No integrator {name!r}. Give one of {', '.join(INTEGRATORS)}.")
+    kind = INTEGRATORS[name]
+    options = {option: settings[option] for option in _OPTIONS if option in settings}
+    known = {field.name for field in fields(kind)}
+    for option in options:
+        if option not in known:
+            raise CommandError(
+                f"Integrator {name} has no option {option}. It has {', '.join(sorted(known))}."
+            )
+    return name, kind(**options)
+
+
+def run(a: argparse.Namespace, ranks: Any) -> None:
+    """``complexbody run``: simulate, check, draw, and write down what was done."""
+    job = _job(a, ranks)
+    until = job.until
+    if until is None:
+        raise CommandError(
+            f"Nothing says when to stop. Give --until T, or DEFAULTS = dict(until=…) in {a.file}."
+        )
+    if not a.quiet:
+        say(ranks, report.heading(job.file.path, job.scene, job.parameters))
+    with together(ranks):
+        output = job.output()
+        growth = None if job.settings.get("unstable_ok") else 10.0
+        progress = False if a.quiet else None
+        simulation = Simulation(
+            job.scene, job.method, until=until, output=output, ledger_steps=job.ledger_steps,
+            growth=growth, progress=progress,
+        )  # fmt: skip
+    if not a.quiet:
+        say(ranks, *report.before(simulation, job.name, job.method, output, until))
+    with _recorded(a, job, output, ranks) as done:
+        with together(ranks):
+            result = simulation.run()
+        done.update(report.results(result))
+        if not a.quiet:
+            say(ranks, *report.after(result))
+        failure = _checked(job.file, result, done, ranks)
+        if failure is None and "check" in done and not a.quiet:
+            say(ranks, report.entry("check", done["check"]))
+        if not a.no_picture and job.file.has("picture"):
+            with together(ranks):
+                _draw(job.file, result, output, done, ranks)
+        if failure is not None:
+            raise failure
+    if not a.quiet:
+        say(ranks, report.entry("files", str(output.folder)))
+
+
+def _checked(
+    file: SceneFile, result: Result, done: dict[str, Any], ranks: Any
+) -> CheckFailed | None:
+    """Call the file's check; a failure is kept until the picture is drawn. Collective."""
+    if not file.has("check"):
+        return None
+    try:
+        with together(ranks):
+            done["check"] = file.check(result)
+    except CheckFailed as failure:
+        done["check"] = str(failure)
+        return failure
+    return None
+
+
+def _draw(
+    file: SceneFile, result: Result, output: Output, done: dict[str, Any], ranks: Any
+) -> None:
+    """Call the file's picture(); what is not installed for it is a warning. Collective."""
+    path = Path(output.folder) / "picture.png"
+    missing = ""
+    try:
+        if file.draws_with_vtk:
+            on_first_rank(ranks, path, require_vtk)
+        file.picture(result, path)
+        done["picture"] = path.name
+        return
+    except MissingPackage as error:
+        missing = str(error)
+    except CommandError as error:
+        if not isinstance(error.__cause__, ImportError):
+            raise
+        missing = str(error)
+    done["picture"] = f"not drawn: {missing}"
+    say(ranks, f"complexbody: warning: no picture: {missing}", stream=sys.stderr)
+
+
+@contextmanager
+def _recorded(
+    a: argparse.Namespace, job: Job, output: Output, ranks: Any
+) -> Iterator[dict[str, Any]]:
+    """Keep run.json: at first what is to be run, in the end what came of it; collective."""
+    begun = time.perf_counter()
+    path = Path(output.folder) / "run.json"
+    kept: list[report.Record] = []
+    values = {
+        "command": shlex.join(["complexbody", *a.words]),
+        "scene": job.scene.name,
+        "file": str(job.file.path.resolve()),
+        "sha256": hashlib.sha256(job.file.path.read_bytes()).hexdigest(),
+        "parameters": dict(job.parameters),
+        "settings": {k: v for k, v in job.settings.items() if k != "out"},
+        "bodies": {body.name: dict(body.constants) for body in job.scene.bodies},
+        "ranks": ranks.size,
+        "started": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+    }
+    on_first_rank(ranks, path, lambda: kept.append(report.Record(path, values)))
+    done: dict[str, Any] = {}
+    state = "finished"
+    try:
+        yield done
+    except BaseException as error:
+        state = f"failed: {error}" if isinstance(error, Exception) else str(error)
+        if isinstance(error, Interrupted):
+            error.args = (f"{error}; what was written until then is in {output.folder}",)
+        raise
+    finally:
+        # Not collective: after a signal the ranks need not meet again.
+        for record in kept:
+            with suppress(OSError):
+                record.update(state, seconds=time.perf_counter() - begun, **done)
+
+
+def check(a: argparse.Namespace, ranks: Any) -> None:
+    """``complexbody check``: build everything, and say what run would do."""
+    job = _job(a, ranks)
+    with together(ranks), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # null modes are part of the report
+        problem = Problem(job.scene)
+        if job.settings.get("probes"):
+            Probes(job.scene, job.output().probes)
+        job.output()
+    say(ranks, report.heading(job.file.path, job.scene, job.parameters))
+    disc, comm = problem.disc, problem.comm
+    cells = comm.allreduce(int((disc.source_cell >= 0).sum()))
+    nodes = comm.allreduce(int(disc.owned.sum()))
+    say(ranks, report.mesh(job.scene, cells, nodes, comm.size), *report.bodies(job.scene))
+    for number in range(len(job.scene.bodies)):
+        with together(ranks):
+            least = precheck.smallest_eigenvalue(problem, number)
+        say(ranks, report.energy(problem, number, least))
+    linear = "linear in (u, ν)" if problem.kernels.densities.linear else "nonlinear"
+    say(ranks, report.entry("forces", linear))
+    with together(ranks):
+        found = precheck.limits(problem, getattr(job.method, "dissipation", "exact"))
+    if math.isfinite(found.smallest):
+        say(ranks, *report.quality(found))
+    say(ranks, report.integrator(job.name, job.method))
+    with together(ranks):
+        until = job.until if job.until is not None else 100 * found.smallest
+        prepared = job.method.prepare(problem, until)
+        per_row = precheck.seconds_per_row(Bookkeeper(problem, prepared), comm)
+        per_step = precheck.seconds_per_step(prepared, comm)
+        problem.close()
+    say(ranks, report.memory(problem.kernels.bytes_per_cell(), cells))
+    say(ranks, report.step(prepared.step, prepared.critical, job.until))
+    rate = cells / per_step / comm.size
+    say(ranks, report.entry("rate", f"{rate / 1e6:.3g} million cell updates per second and core"))
+    if job.until is None:
+        say(ranks, report.entry("time", "give --until T for an estimate"))
+        return
+    steps = report.steps(prepared.step, until)
+    every = job.ledger_steps or default_ledger_steps(cells, comm.size, steps)
+    whole = steps * per_step + (steps / every + 2) * per_row
+    say(ranks, report.entry("time", f"about {report.seconds(whole)}, without writing fields"))
+
+
+def info(a: argparse.Namespace, ranks: Any) -> None:
+    """``complexbody info``: what this installation is made of."""
+    if ranks.rank == 0:
+        say(ranks, *machine.description())

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The typed errors of complexbody.
+
+Each message says in one sentence what is wrong and in one what to do. Whatever depends on data that
+differ between ranks goes through :func:`agree`, so that every rank raises or none does.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class ComplexBodyError(Exception):
+    """Base of every error a user of complexbody can cause or meet."""
+
+    exit_code = 2
+
+
+class BodyError(ComplexBodyError, ValueError):
+    """A body is ill posed: shapes, density, inertia, viscosity or energy."""
+
+
+class CoercivityError(BodyError):
+    """The Hessian of the energy density is not symmetric, not finite or not coercive (A1)."""
+
+
+class SceneError(ComplexBodyError, ValueError):
+    """A scene does not fit together: supports, loads, tags, initial data."""
+
+
+class MeshError(ComplexBodyError, ValueError):
+    """A mesh has inverted, flat or non-finite cells, or cells complexbody does not know."""
+
+
+class IntegratorError(ComplexBodyError, ValueError):
+    """An integrator cannot take this body, or was given options that exclude each other."""
+
+
+class StepError(IntegratorError):
+    """A time step is not positive, or is larger than the critical one."""
+
+
+class OutputError(ComplexBodyError, OSError):
+    """Results cannot be written where the user asked."""
+
+
+class CommandError(ComplexBodyError):
+    """The command line or a scene file is wrong."""
+
+
+class MissingPackage(ComplexBodyError, ImportError):
+    """An optional package or a compiler is not there; the message has the install line."""
+
+    exit_code = 3
+
+
+class DivergenceError(ComplexBodyError, ArithmeticError):
+    """A run produced non-finite values or energy it was not given."""
+
+    exit_code = 4
+
+
+def agree(comm: Any, error: Exception | None) -> None:
+    """Raise on all ranks of ``comm`` if any rank holds an error; collective.
+
+    Args:
+        comm: An mpi4py communicator.
+        error: What this rank found, or None.
+
+    Raises:
+        Exception: the error of the lowest rank that has one, with its own type, on every rank.
+    """
+    found = comm.allgather(None if error is None else (type(error), str(error)))
+    for rank, entry in enumerate(found):
+        if entry is not None:
+            kind, text = entry
+            where = "" if comm.size == 1 or f"rank {rank}" in text else f" (rank {rank})"
+            raise kind(text + where)

@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Reading a density symbolically: is it quadratic, what is its Hessian, is it coercive (A1)?
+
+A UFL density is evaluated over polynomials in the unknowns (∇u, ∇ν, u, ν) instead of numbers.
+What remains of degree two or less is the density exactly: no differentiation, no sampling.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import ufl
+from dolfinx import fem
+from ufl import classes as uc
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
+
+from complexbody import _compat
+from complexbody.errors import CoercivityError
+
+#: Monomial (sorted indices of unknowns, at most two) -> coefficient (float or UFL scalar).
+Poly = dict[tuple[int, ...], Any]
+
+
+class NotQuadratic(Exception):
+    """The density is not a polynomial of degree two in the unknowns."""
+
+
+@dataclass(frozen=True)
+class Quadratic:
+    """c + l·g + ½ g·Hg with g = (∂_j q_i at 3i + j, then q_i at 3n + i), q = (u, ν).
+
+    Attributes:
+        constant: c.
+        linear: l by index.
+        hessian: H by (row, column), both triangles; entries are floats or UFL scalars.
+        cellwise: True if every entry is constant on each cell, so that a kernel can be generated.
+    """
+
+    constant: Any
+    linear: dict[int, Any]
+    hessian: dict[tuple[int, int], Any]
+    cellwise: bool
+
+    def expressions(self) -> list[Any]:
+        """The distinct coefficients that vary between cells, as UFL scalars."""
+        found: list[Any] = []
+        for value in (self.constant, *self.linear.values(), *self.hessian.values()):
+            if not isinstance(value, float) and value not in found:
+                found.append(value)
+        return found
+
+
+def read(density: Callable[..., Any], mesh: Any, n_u: int, k: int, values: str) -> Quadratic | None:
+    """Read a density off as a quadratic polynomial, or return None if it is not one.
+
+    Args:
+        density: ``e(U, nu, N)`` if ``values`` is "gradients", ``w(u, nu)`` if it is "fields".
+        mesh: The dolfinx mesh, whose dimension says which columns of U and N exist.
+        n_u: Components of u.
+        k: Components of ν.
+        values: Which of the two it is.
+    """
+    n, dim, domain = n_u + k, mesh.geometry.dim, mesh.ufl_domain()
+    u, nu = ufl.Constant(domain, shape=(n_u,)), ufl.Constant(domain, shape=(k,))
+    U, N = ufl.Constant(domain, shape=(n_u, 3)), ufl.Constant(domain, shape=(k, 3))
+
+    def unknown(terminal: Any, component: tuple[int, ...]) -> Poly | None:
+        if terminal is U or terminal is N:
+            i, j = component
+            return {(3 * (i + (n_u if terminal is N else 0)) + j,): 1.0} if j < dim else {}
+        if terminal is u or terminal is nu:
+            return {(3 * n + component[0] + (n_u if terminal is nu else 0),): 1.0}
+        return None
+
+    expression = density(U, nu, N) if values == "gradients" else density(u, nu)
+    reader = _Reader(unknown)
+    try:
+        lowered = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(expression)))
+        poly = reader.visit(lowered, (), {})
+    except NotQuadratic:
+        return None
+    hessian: dict[tuple[int, int], Any] = {}
+    for monomial, value in poly.items():
+        if len(monomial) == 2:
+            a, b = monomial
+            hessian[a, b] = hessian[b, a] = _times(value, 2.0) if a == b else value
+    linear = {m[0]: value for m, value in poly.items() if len(m) == 1}
+    return Quadratic(poly.get((), 0.0), linear, hessian, reader.cellwise)
+
+
+class _Reader:
+    """Evaluates lowered UFL over polynomials; ``cellwise`` turns False at a varying coefficient."""
+
+    def __init__(self, unknown: Callable[[Any, tuple[int, ...]], Poly | None]) -> None:
+        self.unknown = unknown
+        self.cellwise = True
+
+    def visit(self, e: Any, c: tuple[int, ...], at: dict[Any, int]) -> Poly:
+        """Polynomial of component ``c`` of ``e`` with free indices bound by ``at``."""
+        ops = e.ufl_operands
+        if isinstance(e, uc.Zero):
+            return {}
+        if isinstance(e, uc.ScalarValue):
+            return _constant(float(e))
+        if isinstance(e, uc.Identity):
+            return _constant(1.0 if c[0] == c[1] else 0.0)
+        if isinstance(e, uc.PermutationSymbol):
+            return _constant(float(_permutation_sign(c)))
+        if isinstance(e, uc.Indexed):
+            return self.visit(ops[0], self._fixed(ops[1], at), at)
+        if isinstance(e, uc.ComponentTensor):
+            bound = dict(at)
+            bound.update(zip((i.count() for i in ops[1]), c, strict=True))
+            return self.visit(ops[0], (), bound)
+        if isinstance(e, uc.ListTensor):
+            return self.visit(ops[c[0]], c[1:], at)
+        if isinstance(e, uc.IndexSum):
+            index = ops[1][0].count()
+            return _sum(self.visit(ops[0], c, {**at, index: i}) for i in range(e.dimension()))
+        if isinstance(e, uc.Variable | uc.Conj | uc.Real):  # everything here is real
+            return self.visit(ops[0], c, at)
+        if isinstance(e, uc.Sum):
+            return _sum(self.visit(o, c, at) for o in _terms(e))
+        if isinstance(e, uc.Product):
+            return _product(self.visit(ops[0], (), at), self.visit(ops[1], (), at))
+        if isinstance(e, uc.Division):
+            return self._over(self.visit(ops[0], c, at), self.visit(ops[1], (), at))
+        if isinstance(e, uc.Power):
+            return self._power(self.visit(ops[0], (), at), self.visit(ops[1], (), at))
+        if not ops or isinstance(e, uc.Derivative):  # gradients of coefficients are left, no others
+            known = self.unknown(e, c)
+            return self._coefficient(e, c) if known is None else known
+        return self._function(e, [self.visit(o, (), at) for o in ops])
+
+    def _fixed(self, multi: Any, at: dict[Any, int]) -> tuple[int, ...]:
+        return tuple(int(i) if isinstance(i, uc.FixedIndex) else at[i.count()] for i in multi)
+
+    def _coefficient(self, e: Any, c: tuple[int, ...]) -> Poly:
+        if isinstance(e, fem.Constant):
+            return _constant(float(np.asarray(e.value)[c]))
+        if not (isinstance(e, fem.Function) and _compat.is_cellwise(e)):
+            self.cellwise = False
+        return {(): e[c] if c else e}
+
+    def _over(self, a: Poly, b: Poly) -> Poly:
+        if any(b) or () not in b:  # division by an unknown, or by zero
+            raise NotQuadratic
+        return {m: v / b[()] for m, v in a.items()}
+
+    def _power(self, base: Poly, exponent: Poly) -> Poly:
+        if any(exponent):
+            raise NotQuadratic
+        p = exponent.get((), 0.0)
+        if not any(base):
+            return {(): base.get((), 0.0) ** p}
+        if not isinstance(p, float) or p not in (0.0, 1.0, 2.0):
+            raise NotQuadratic
+        if p == 0.0:
+            return {(): 1.0}
+        return base if p == 1.0 else _product(base, base)
+
+    def _function(self, e: Any, arguments: list[Poly]) -> Poly:
+        # A function of coefficients alone is a coefficient; of an unknown, no polynomial.
+        if any(any(a) for a in arguments) or isinstance(e, uc.Conditional | uc.Condition):
+            raise NotQuadratic
+        operands = [ufl.as_ufl(a.get((), 0.0)) for a in arguments]
+        value = e._ufl_expr_reconstruct_(*operands)
+        return _constant(float(value)) if isinstance(value, uc.ScalarValue) else {(): value}
+
+
+def _constant(value: float) -> Poly:
+    return {(): value} if value != 0.0 else {}
+
+
+def _terms(e: Any) -> list[Any]:
+    """Terms of nested sums: a long sum is as deep as it is long, too deep for recursion."""
+    terms, stack = [], [e]
+    while stack:
+        top = stack.pop()
+        if isinstance(top, uc.Sum):
+            stack.extend(reversed(top.ufl_operands))
+        else:
+            terms.append(top)
+    return terms
+
+
+def _times(a: Any, b: Any) -> Any:
+    return a * b
+
+
+def _sum(terms: Any) -> Poly:
+    total: Poly = {}
+    for term in terms:
+        for monomial, value in term.items():
+            total[monomial] = total[monomial] + value if monomial in total else value
+    return {m: v for m, v in total.items() if not (isinstance(v, float) and v == 0.0)}
+
+
+def _product(a: Poly, b: Poly) -> Poly:
+    terms = []
+    for (m, x), (n, y) in itertools.product(a.items(), b.items()):
+        if len(m) + len(n) > 2:
+            raise NotQuadratic
+        terms.append({tuple(sorted(m + n)): _times(x, y)})
+    return _sum(terms)
+
+
+def _permutation_sign(c: tuple[int, ...]) -> int:
+    if len(set(c)) < len(c):
+        return 0
+    return int(
+        math.prod(1 if c[i] < c[j] else -1 for i, j in itertools.combinations(range(len(c)), 2))
+    )
+
+
+def names(n_u: int, k: int) -> list[str]:
+    """Names of the unknowns g: U11 … , N11 … , u1 …, nu1 …, in the order of :class:`Quadratic`."""
+    gradients = [f"U{i + 1}{j + 1}" for i in range(n_u) for j in range(3)]
+    gradients += [f"N{i + 1}{j + 1}" for i in range(k) for j in range(3)]
+    return gradients + [f"u{i + 1}" for i in range(n_u)] + [f"nu{i + 1}" for i in range(k)]
+
+
+def check_coercive(
+    hessian: npt.NDArray[np.float64], n_u: int, k: int, dim: int, name: str
+) -> list[str]:
+    """Check A1 for Hessians of ρe: symmetric, finite, no negative eigenvalue on (sym U, ν, N).
+
+    Args:
+        hessian: H of ρe, shape (m, 4n, 4n), in the order of :class:`Quadratic`; m samples.
+        n_u: Components of u.
+        k: Components of ν.
+        dim: Dimension of the mesh: other columns of U and N do not exist.
+        name: The body's name, for messages.
+
+    Returns:
+        The null modes other than rigid rotations, in words: semidefinite directions, which the
+        boundary data must hold.
+
+    Raises:
+        CoercivityError: with the eigenvalue and the mode.
+    """
+    n, labels = n_u + k, names(n_u, k)
+    if not np.all(np.isfinite(hessian)):
+        raise CoercivityError(f"The energy of {name} has a Hessian that is not finite. Check it.")
+    keep = [3 * i + j for i in range(n) for j in range(dim)] + [3 * n + n_u + i for i in range(k)]
+    # A descriptor the energy does not see is held by its gradients, as u is by its own.
+    seen = np.abs(hessian).max(axis=(0, 2), initial=0.0) > 0
+    keep = [i for i in keep if i < 3 * n or seen[i]]
+    h = hessian[:, keep][:, :, keep]
+    # Units differ between U, N and ν: compare each with its own diagonal.
+    d = np.sqrt(np.abs(np.einsum("mii->mi", h)))
+    d = np.where(d > 0, d, d.max(axis=1, keepdims=True, initial=1e-150))  # its square is divided by
+    values, vectors = np.linalg.eigh(h / (d[:, :, None] * d[:, None, :]))
+    worst = int(np.argmin(values[:, 0]))
+    tolerance = 1e-11
+
+    def words(vector: npt.NDArray[np.float64], scale: npt.NDArray[np.float64]) -> str:
+        mode = vector / scale
+        mode = mode / mode[np.argmax(np.abs(mode))]
+        big = [i for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.05][:6]
+        return " ".join(f"{mode[i]:+.3g} {labels[keep[i]]}" for i in big)
+
+    if values[worst, 0] < -tolerance:
+        mode = vectors[worst, :, 0]
+        amount = float(mode / d[worst] @ h[worst] @ (mode / d[worst]))
+        raise CoercivityError(
+            f"The energy of {name} is not coercive (A1): along the mode {words(mode, d[worst])} it "
+            f"is negative (relative eigenvalue {values[worst, 0]:.3e}, g·Hg = {amount:.3e} J/m³). "
+            "Change the constants so that the coupling stays below the bound of the form."
+        )
+    # Rigid rotations (skw U) are the null modes that objectivity demands (Korn).
+    rotations = []
+    for i, j in itertools.combinations(range(min(n_u, dim)), 2):
+        r = np.zeros(len(labels))
+        r[3 * i + j], r[3 * j + i] = 1.0, -1.0
+        rotations.append(r[keep] * d[worst])
+    null = vectors[worst][:, values[worst] < tolerance]
+    if rotations:
+        q, _ = np.linalg.qr(np.array(rotations).T)
+        null = null - q @ (q.T @ null)
+    left, sizes, _ = np.linalg.svd(null, full_matrices=False) if null.size else (null, [], None)
+    return [words(left[:, i], d[worst]) for i, size in enumerate(sizes) if size > 1e-6]

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The synchronous explicit variational integrator, as the user says it: one step for all cells.
+
+Kick–drift–kick with lumped masses (paper (Discr-dAL1s), (Discr-dAL2s) with the dissipation's sign
+corrected). What it does once it runs is in :mod:`complexbody.integrators.synchronous_run`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from complexbody.errors import IntegratorError, StepError
+from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.masses import SCHEMES
+from complexbody.problem import Problem
+from complexbody.timesets import critical_step
+
+
+@dataclass(frozen=True)
+class Synchronous:
+    """Explicit variational integrator with one step for the whole body.
+
+    Attributes:
+        step: Step h [s]; by default ``safety`` times the critical one, shortened so that the end
+            of the run falls on a step.
+        safety: Fraction of the critical step to use.
+        dissipation: "exact" (order 2), "symmetric" (order 2, paper (dissdiscr1)) or "forward"
+            (order 1, the paper's (dissdiscr)).
+        start: "trapezoidal" (first kick of weight h/2, order 2) or "one-sided" (the paper's).
+        critical: "cells" bounds the critical step by the cells' own pencils; "global" computes it
+            by SLEPc (linear forces only), at the cost of an eigenvalue solve.
+        unstable_ok: Run even with a step above the critical one.
+
+    Raises:
+        IntegratorError: for options that do not exist.
+        StepError: for a step or safety factor that is not positive.
+    """
+
+    step: float | None = None
+    safety: float = 0.9
+    dissipation: str = "exact"
+    start: str = "trapezoidal"
+    critical: str = "cells"
+    unstable_ok: bool = False
+
+    explicit: ClassVar[bool] = True
+    asynchronous: ClassVar[bool] = False
+    symplectic: ClassVar[bool] = True
+    inertia: ClassVar[str] = "number or k×k matrix; 0 where viscosity is positive"
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("dissipation", SCHEMES),
+            ("start", ("trapezoidal", "one-sided")),
+            ("critical", ("cells", "global")),
+        ):
+            if getattr(self, name) not in allowed:
+                raise IntegratorError(
+                    f"Synchronous: {name}={getattr(self, name)!r} is not known. Give one of "
+                    f"{', '.join(allowed)}."
+                )
+        for name in ("step", "safety"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise StepError(f"Synchronous: {name} is {value}. Give a positive number.")
+
+    @property
+    def order(self) -> int:
+        """Order of convergence in the step."""
+        return 1 if self.dissipation == "forward" or self.start == "one-sided" else 2
+
+    def prepare(self, problem: Problem, until: float) -> SynchronousRun:
+        """Choose the step and set up the run; collective.
+
+        Raises:
+            StepError: if the step is above the critical one and ``unstable_ok`` is False.
+            IntegratorError: if the body does not fit the dissipation scheme.
+        """
+        critical = critical_step(problem, self.dissipation, self.critical)
+        step = self.step
+        if step is None:
+            step = min(self.safety * critical, until)
+            step = until / np.ceil(until / step * (1 - 1e-12))
+        if step > critical * (1 + 1e-9) and not self.unstable_ok:
+            raise StepError(
+                f"The step {step:.6g} s is larger than the critical step {critical:.6g} s, so the "
+                "run would be unstable. Give a smaller step, or unstable_ok=True to see it happen."
+            )
+        return SynchronousRun(problem, self, float(step), float(critical))

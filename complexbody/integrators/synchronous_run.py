@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A synchronous run in progress: forces, kicks and drifts, exchange between ranks, samples.
+
+Every force acts at the step's time, every node drifts between. The state kept is (x_n, v_{n−½});
+what a user sees at t_n follows from it without disturbing it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from complexbody import native
+from complexbody.errors import IntegratorError
+from complexbody.integrators.entries import Entries
+from complexbody.integrators.synchronous_books import entries
+from complexbody.problem import Problem
+
+if TYPE_CHECKING:
+    from complexbody.integrators.synchronous import Synchronous
+
+Array = npt.NDArray[np.float64]
+
+
+class SynchronousRun:
+    """A synchronous run in progress.
+
+    Attributes:
+        time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
+        updates: Cell updates done by this rank.
+        support_work: Work of this rank's moving supports in the half step before a sample [J].
+    """
+
+    def __init__(self, problem: Problem, method: Synchronous, step: float, critical: float) -> None:
+        self.problem, self.method, self.step, self.critical = problem, method, step, critical
+        self.steps, self.updates, self.ready = 0, 0, False
+        disc, kernels, masses = problem.disc, problem.kernels, problem.masses
+        if not masses.diagonal:  # the same on all ranks, unlike what moves there
+            self._refuse_partial()
+        kernels.select(masses.diagonal, masses.damped)
+        self.c, self.state = kernels.c, ctypes.byref(kernels.state)
+        rec = masses.recursion(step, method.dissipation)
+        if method.start == "one-sided":
+            # Kicks sit at the left ends of intervals: momenta at t_n are those before the kick.
+            rec.force_to_rate = rec.massless
+        self.recursion = rec
+
+        def pack(matrices: Array) -> Array:
+            return masses.pack(matrices, disc.record)
+
+        self._tables = [pack(m) for m in (rec.alpha, rec.beta, rec.viscosity)]
+        self._to_rate, self._force_to_rate = pack(rec.to_rate), pack(rec.force_to_rate)
+        self.mean = np.ascontiguousarray(rec.mean)
+        self.eta = np.ascontiguousarray(rec.viscosity)
+        self.mass = np.ascontiguousarray(rec.mass)
+        s = kernels.state
+        s.step = step
+        s.alpha, s.beta, s.eta = (t.ctypes.data for t in self._tables)
+        self._single = len(masses.density) == 1
+        s.klass = 0 if self._single else masses.classes.ctypes.data
+        self.rates, self.scratch = (native.aligned(kernels.x.shape) for _ in range(2))
+        kernels.sums[:] = 0.0
+        kernels.x[:] = 0.0
+        kernels.v[:] = 0.0
+        kernels.x[:-1, : disc.n] = problem.initial_fields
+        self.support_work = 0.0
+        kernels.reset_forces()
+
+    @property
+    def time(self) -> float:
+        """t_n = n h [s], from the counter: never summed up."""
+        return self.steps * self.step
+
+    def _refuse_partial(self) -> None:
+        n_u, (rows, columns) = self.problem.scene.displacement, self.problem.moving
+        masses, nodes = self.problem.masses, rows[columns >= n_u]
+        bad = not np.all(masses.fixed[masses.classes[nodes], n_u:])
+        if self.problem.comm.allreduce(bool(bad), op=MPI.LOR):
+            raise IntegratorError(
+                "A moving support prescribes some components of a descriptor whose inertia or "
+                "viscosity couples them. Prescribe all components there, or diagonalise the matrix."
+            )
+
+    # --- forces at t_n -----------------------------------------------------------------------
+
+    def forces(self) -> None:
+        """Bring f to the forces at (x_n, t_n), summed over ranks; once per step at most."""
+        if self.ready:
+            return
+        problem = self.problem
+        problem.load_forces(self.amplitude(self.time))
+        self.c.cb_forces(self.state)
+        self.updates += problem.disc.count
+        if problem.comm.size > 1:
+            self._exchange_begin()
+            self._exchange_end()
+        self.ready = True
+
+    def amplitude(self, t: float) -> Array:
+        """Factors of the loads' groups at t [s]."""
+        return self.problem.loads.amplitudes(np.array([t]))[0]
+
+    def _exchange_begin(self) -> None:
+        halo, disc, kernels = self.problem.disc.halo, self.problem.disc, self.problem.kernels
+        self.c.cb_pack(
+            ctypes.c_int64(len(halo.sends)), native.pointer(halo.sends),
+            ctypes.c_void_p(kernels.f.ctypes.data + disc.late * disc.record * 8),
+            native.pointer(halo.outgoing),
+        )  # fmt: skip
+        halo.begin()
+
+    def _exchange_end(self) -> None:
+        halo, disc, kernels = self.problem.disc.halo, self.problem.disc, self.problem.kernels
+        halo.end()
+        self.c.cb_sum_shared(
+            ctypes.c_int64(disc.shared), ctypes.c_int64(disc.late), native.pointer(halo.start),
+            native.pointer(halo.source), native.pointer(halo.incoming), native.pointer(kernels.f),
+        )  # fmt: skip
+
+    # --- steps -------------------------------------------------------------------------------
+
+    def advance(self, steps: int) -> None:
+        """Do ``steps`` steps; collective."""
+        if steps > 0 and self.steps == 0:
+            self._first()
+            steps -= 1
+        if steps > 0 and self.ready:
+            self._unfused()
+            steps -= 1
+        if steps <= 0:
+            return
+        problem, disc = self.problem, self.problem.disc
+        self.updates += steps * disc.count
+        alone = problem.comm.size == 1 and not len(problem.moving[0])
+        if alone:
+            times = (self.steps + np.arange(steps)) * self.step
+            amplitudes = np.ascontiguousarray(problem.loads.amplitudes(times))
+            self.c.cb_steps(
+                self.state, ctypes.c_int64(steps), ctypes.c_int64(len(problem.load_value)),
+                native.pointer(problem.load_position), native.pointer(problem.load_group),
+                native.pointer(problem.load_value), native.pointer(amplitudes),
+                ctypes.c_int64(amplitudes.shape[1]),
+            )  # fmt: skip
+            self.steps += steps
+            return
+        for _ in range(steps):
+            self._overlapped()
+
+    def _overlapped(self) -> None:
+        """One step with messages flying while interior cells are worked on."""
+        problem, kernels = self.problem, self.problem.kernels
+        amplitude = self.amplitude(self.time)
+        problem.load_forces(amplitude)
+        kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
+        self.c.cb_boundary_forces(self.state)
+        if problem.comm.size > 1:
+            self._exchange_begin()
+        self.c.cb_interior_step(self.state)
+        if problem.comm.size > 1:
+            self._exchange_end()
+        self._late()
+        kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
+        self.steps += 1
+
+    def _unfused(self) -> None:
+        """A step whose forces are there already, after a sample."""
+        problem, kernels = self.problem, self.problem.kernels
+        amplitude = self.amplitude(self.time)
+        kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
+        self.c.cb_update(self.state, ctypes.c_int64(0), ctypes.c_int64(problem.disc.late))
+        self._late()
+        kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
+        self.steps += 1
+        self.ready = False
+
+    def _late(self) -> None:
+        disc = self.problem.disc
+        if len(self.problem.moving[0]):
+            self._move()
+        self.c.cb_update(self.state, ctypes.c_int64(disc.late), ctypes.c_int64(disc.nodes))
+
+    def _move(self) -> None:
+        rows, columns = self.problem.moving
+        target = self.problem.targets((self.steps + 1) * self.step)
+        self.c.cb_move(
+            self.state, ctypes.c_int64(len(rows)), native.pointer(rows), native.pointer(columns),
+            native.pointer(target), native.pointer(self.mean), native.pointer(self.eta),
+        )  # fmt: skip
+
+    def _first(self) -> None:
+        """The first kick: half of it (trapezoidal) or the whole (one-sided), on initial rates."""
+        problem, kernels, disc, rec = (
+            self.problem, self.problem.kernels, self.problem.disc, self.recursion,
+        )  # fmt: skip
+        self.forces()
+        n, weight = disc.n, 0.5 if self.method.start == "trapezoidal" else 1.0
+        v0 = problem.rates_at_start(1e-3 * self.step)
+        klass = problem.masses.classes[:-1]
+        f = kernels.f[:-1, :n] * kernels.inverse_volume[:, None]
+        v1 = np.einsum("aij,aj->ai", rec.from_rate[klass], v0)
+        v1 += weight * np.einsum("aij,aj->ai", rec.beta[klass], f)
+        rows, columns = problem.moving
+        if len(rows):
+            v1[rows, columns] = (problem.targets(self.step) - kernels.x[rows, columns]) / self.step
+        both, owned = v0 + v1, disc.owned
+        # Half a step: (M̂ + hD/2)v⁺ − Mq̇₀ = (h/2)f times the mean of its ends' rates balances
+        # ½v⁺·M̂v⁺ − ½q̇₀·Mq̇₀ (also where hη ≫ ρ̄) with the works of loads and supports.
+        lost = np.einsum("ai,aij,aj->a", v0, (self.mean - self.mass)[klass], v1)
+        lost += 0.5 * self.step * np.einsum("ai,aij,aj->a", both, self.eta[klass], v1)
+        kernels.sums[0] += 0.5 * np.sum(lost * disc.volume * owned)
+        amplitude = self.amplitude(0.0)
+        full = np.zeros_like(kernels.v)
+        full[:-1, :n] = both
+        kernels.sums[3] += self.step / 4 * problem.load_power(amplitude, full)
+        if len(rows):
+            momentum = np.einsum("aij,aj->ai", (self.mean + 0.5 * self.step * self.eta)[klass], v1)
+            momentum -= np.einsum("aij,aj->ai", self.mass[klass], v0)
+            impulse = disc.volume[:, None] * (momentum - weight * self.step * f)
+            kernels.sums[4] += (0.5 * impulse * both * owned[:, None])[rows, columns].sum()
+        jump = np.abs(v1 - v0) * (disc.volume * owned)[:, None]
+        n_u = problem.scene.displacement
+        kernels.sums[1] += jump[:, :n_u].sum()
+        kernels.sums[2] += jump[:, n_u:].sum()
+        kernels.v[:-1, :n] = v1
+        kernels.x[:-1, :n] += self.step * v1
+        kernels.reset_forces()
+        self.steps, self.ready = 1, False
+
+    # --- what a user sees at t_n -------------------------------------------------------------
+
+    def sample(self) -> tuple[Array, Array]:
+        """(u, ν) and rates at t_n as node records (nodes + 1, NR): views, valid until a step."""
+        kernels, disc = self.problem.kernels, self.problem.disc
+        self.forces()
+        if self.steps == 0:
+            self.rates[:] = 0.0
+            self.rates[:-1, : disc.n] = self._rates_before_first()
+        else:
+            self.c.cb_rates(
+                self.state, native.pointer(self._to_rate), native.pointer(self._force_to_rate),
+                ctypes.c_int64(0), ctypes.c_int64(disc.nodes), native.pointer(self.rates),
+            )  # fmt: skip
+            if len(self.problem.moving[0]):
+                self._sample_moving()
+        return kernels.x, self.rates
+
+    def _sample_moving(self) -> None:
+        """Rates of moving supports at t_n (mean of both drifts), work of their last half step."""
+        problem, kernels, disc, h = self.problem, self.problem.kernels, self.problem.disc, self.step
+        (rows, columns), n = problem.moving, disc.n
+        nodes, at = np.unique(rows, return_inverse=True)
+        after = (problem.targets(self.time + h) - kernels.x[rows, columns]) / h
+        before, jump, both = (np.zeros((len(nodes), n)) for _ in range(3))
+        before[at, columns] = kernels.v[rows, columns]
+        jump[at, columns] = after - kernels.v[rows, columns]
+        both[at, columns] = after + kernels.v[rows, columns]
+        self.rates[rows, columns] = 0.5 * both[at, columns]
+        klass = problem.masses.classes[nodes]
+        impulse = np.einsum("aij,aj->ai", self.mean[klass], jump)
+        impulse += 0.5 * h * np.einsum("aij,aj->ai", self.eta[klass], both)
+        impulse = disc.volume[nodes, None] * impulse - h * kernels.f[nodes, :n]
+        # Half of the kick acts before t_n, on rates between v⁻ and those at t_n.
+        work = 0.25 * impulse * (before + 0.5 * both) * disc.owned[nodes, None]
+        self.support_work = float(work[at, columns].sum())
+
+    def _rates_before_first(self) -> Array:
+        """Initial rates; those of components without inertia follow from the forces."""
+        problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
+        v0 = problem.rates_at_start(1e-3 * self.step)
+        klass = problem.masses.classes[:-1]
+        massless = np.einsum("cii->ci", self.mass) == 0
+        if np.any(massless):
+            f = kernels.f[:-1, : disc.n] * kernels.inverse_volume[:, None]
+            rates = np.einsum("aij,aj->ai", self.recursion.force_to_rate[klass], f)
+            mask = massless[klass] & ~problem.masses.fixed[klass]
+            v0[mask] = rates[mask]
+        return v0
+
+    def positions(self) -> Array:
+        """(u, ν) at t_n, node records."""
+        return self.problem.kernels.x
+
+    def entries(self) -> Entries:
+        """Energies and works at t_n, and the discrete energy of the last half step; collective."""
+        return entries(self)

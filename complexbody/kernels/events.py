@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The library of asynchronous events of a scene: its regions' event functions and their replay."""
+
+from __future__ import annotations
+
+import ctypes
+
+from complexbody import native
+from complexbody.kernels.ffcx import Tabulated, TabulatedRecord
+from complexbody.kernels.library import Kernels
+from complexbody.kernels.quadratic import RegionSource
+from complexbody.masses import SCHEMES
+
+
+def regions(kernels: Kernels) -> list[RegionSource | None]:
+    """Source generators of the regions with generated code; None for the others."""
+    d, disc, scene = kernels.densities, kernels.disc, kernels.action.scene
+    lumped = scene.self_action == "lumped"
+    out: list[RegionSource | None] = []
+    for r, generated in enumerate(d.generated):
+        stored = d.stored[r]
+        if not generated or stored is None:
+            out.append(None)
+            continue
+        out.append(
+            RegionSource(r, stored, d.potential[r], disc.n, disc.dim, lumped, d.coefficients)
+        )
+    return out
+
+
+def references(kernels: Kernels) -> int:
+    """Reference values per cell: n·d stresses, and n self-actions if a region may have them."""
+    disc = kernels.disc
+    values = any(region is None or region.has_values for region in regions(kernels))
+    return disc.n * disc.dim + (disc.n if values else 0)
+
+
+class Forms:
+    """Forces and, for a reference, stresses of the regions FFCx takes, as the loops read them."""
+
+    def __init__(self, kernels: Kernels, balanced: bool) -> None:
+        disc, action = kernels.disc, kernels.action
+        self.records = (TabulatedRecord * (2 * len(action.scene.bodies)))()
+        self._keep = []
+        values = references(kernels) > disc.n * disc.dim
+        for r, body in enumerate(action.scene.bodies):
+            if kernels.densities.generated[r]:
+                continue
+            force = kernels.tabulated[r][0]
+            self.records[2 * r] = force.record
+            self._keep.append(force)
+            if balanced:
+                stress = Tabulated(action, disc, form=action.stress_form(body, values))
+                self.records[2 * r + 1] = stress.record
+                self._keep.append(stress)
+
+
+def record_size(components: int, record: int, balanced: bool) -> tuple[int, int, int]:
+    """(doubles per node, slot of its time, slot of 1/volume), as in events.h."""
+    parts = 3 if balanced else 2
+    if record - components >= 2:
+        return parts * record, components, components + 1
+    return parts * record + 2, parts * record, parts * record + 1
+
+
+def load(kernels: Kernels, balanced: bool, damped: bool, slow: bool, scheme: str) -> ctypes.CDLL:
+    """Compile the events of a scene.
+
+    Args:
+        kernels: The scene's kernels.
+        balanced: Nodes carry a constant acceleration, cells a reference.
+        damped: There is viscosity.
+        slow: Components of ν differ in η/ρ̄, lack inertia, or are coupled by Ω or η.
+        scheme: Dissipation scheme.
+    """
+    disc, scene = kernels.disc, kernels.action.scene
+    count = references(kernels) if balanced else 0
+    defines = {
+        "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
+        "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1,
+        "COEFFICIENTS": len(kernels.densities.coefficients), "REFERENCES": count,
+        "BALANCED": int(balanced), "DAMPED": int(damped), "SCHEME": SCHEMES.index(scheme),
+        "SLOW": int(slow),
+    }  # fmt: skip
+    parts = [f"#define {name} {value}" for name, value in defines.items()]
+    parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]
+    cases = ""
+    for r, region in enumerate(regions(kernels)):
+        if region is not None:
+            parts.append(region.event(count))
+            call = f"event_{r}(blocks, c, g, k, held, kept, s, t, w, mode)"
+        else:
+            forms = f"(s)->forms + {2 * r}, (s)->forms + {2 * r + 1}"
+            call = f"tabulated_event({forms}, blocks, first, c, g, held, kept, s, t, w, mode)"
+        cases += f"case {r}: {call}; break; "
+    arguments = "region, blocks, first, c, g, k, held, kept, s, t, w, mode"
+    parts.append(f"#define EVENT({arguments}) switch (region) {{ {cases}}}")
+    library = native.load("\n".join([*parts, native.template("events.c")]))
+    library.cb_change_rates.restype = ctypes.c_double
+    return library

@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+r"""Lumped masses, viscosities and supports of nodes, grouped into classes of equal nodes.
+
+Per unit of a node's lumped volume a node has a mass matrix M = diag(ρ, …, ρ, Ω), a viscosity
+D = diag(0, …, 0, η) and a set of prescribed components. Few combinations occur (regions times
+supports), so matrices are kept per class. Every dissipation scheme is then one recursion with an
+effective mass
+
+.. math:: (\hat M + hD/2)\,v^+ = (\hat M - hD/2)\,v^- + h f,\qquad x \mathrel{+}= h v^+,
+
+v the *mean* rate of a drift: :math:`\hat M = M` ("symmetric"), :math:`M + hD/2` ("forward"),
+:math:`(hD/2)\coth(hD/(2M))` ("exact": the exact flow of ρ̄ν̈ + ην̇ = 0 between kicks; its limit
+M → 0 is hD/2, that of "forward"). Hence one stability criterion, 4M̂ − h²K ≻ 0, and one energy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import scipy.linalg
+
+from complexbody.discretisation import Discretisation
+from complexbody.errors import IntegratorError
+
+Array = npt.NDArray[np.float64]
+SCHEMES = ("exact", "symmetric", "forward")
+
+
+def pencil_basis(mass: Array, viscosity: Array) -> tuple[Array, Array, Array]:
+    """Basis in which M and D of one body are both diagonal.
+
+    Args:
+        mass: Ω, shape (k, k), positive semidefinite.
+        viscosity: η, shape (k, k), positive semidefinite; M + D definite on a common scale.
+
+    Returns:
+        (V, m, d): columns of V with VᵀΩV = diag(m) and Vᵀ η V = diag(d), V of shape (k, k).
+    """
+    a, b = float(np.trace(mass)), float(np.trace(viscosity))
+    # Scaled by their traces, M and D add up to a well-scaled definite matrix.
+    first = mass / a if a > 0 else np.zeros_like(mass)
+    second = viscosity / b if b > 0 else np.zeros_like(viscosity)
+    _, vectors = scipy.linalg.eigh(first if a > 0 else second, first + second)
+    m = np.einsum("ji,jk,ki->i", vectors, mass, vectors)
+    d = np.einsum("ji,jk,ki->i", vectors, viscosity, vectors)
+    # Round-off must not turn a missing inertia into a tiny one.
+    return vectors, np.where(m > 1e-13 * a, m, 0.0), np.where(d > 1e-13 * b, d, 0.0)
+
+
+def effective(m: Array, d: Array, h: float | Array, scheme: str) -> Array:
+    """M̂(h) of a diagonal pencil: m, d ≥ 0 per component, h [s]; elementwise.
+
+    Raises:
+        IntegratorError: if the scheme cannot take a component without inertia.
+    """
+    m, d = np.asarray(m, dtype=np.float64), np.asarray(d, dtype=np.float64)
+    if scheme == "symmetric":
+        if np.any(m == 0):
+            raise IntegratorError(
+                'dissipation="symmetric" has no limit for a descriptor without inertia. Use '
+                'dissipation="exact" or "forward".'
+            )
+        return m + 0 * d * h
+    half = 0.5 * d * h
+    if scheme == "forward":
+        return m + half
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = np.where(m > 0, half / np.where(m > 0, m, 1.0), np.inf)
+        # s coth s = 1 + s²/3 − … near 0, → s at infinity.
+        factor = np.where(s < 1e-4, 1.0 + s**2 / 3.0, s / np.tanh(np.minimum(s, 1e3)))
+        return np.where(m > 0, m * np.where(np.isfinite(factor), factor, 1.0), half)
+
+
+@dataclass
+class Recursion:
+    """Matrices per class (classes, n, n), per unit volume, for one step h.
+
+    Attributes:
+        alpha, beta: v⁺ = α v⁻ + β f / volume on free components; identity and 0 on prescribed.
+        mean: M̂; viscosity: D; mass: M.
+        to_rate, force_to_rate: q̇ at the step's own time = A v⁻ + B f / volume.
+        massless: Part of ``force_to_rate`` that no kick carries: D q̇ = f where there is no inertia.
+        from_rate: v⁺ of the first step = C q̇₀ + w β f / volume with w = ½ (trapezoidal) or 1.
+    """
+
+    alpha: Array
+    beta: Array
+    mean: Array
+    viscosity: Array
+    mass: Array
+    to_rate: Array
+    force_to_rate: Array
+    massless: Array
+    from_rate: Array
+
+
+@dataclass
+class Diagonal:
+    """A basis per class, rates = vectors @ y, with diagonal inertia and viscosity.
+
+    Attributes:
+        vectors, inverse: Shape (classes, n, n); identity on u and on prescribed components.
+        mass, viscosity: Diagonals per unit volume, shape (classes, n).
+    """
+
+    vectors: Array
+    inverse: Array
+    mass: Array
+    viscosity: Array
+
+
+class Masses:
+    """Classes of nodes of a discretised scene with constant inertia.
+
+    Args:
+        disc: The scene's arrays.
+        fixed: Prescribed components, shape (nodes, n).
+
+    Attributes:
+        classes: Class of each node, shape (nodes + 1,), int32.
+        density: ρ per class; inertia, viscosity: Ω, η per class (classes, k, k).
+        fixed: Prescribed components per class (classes, n).
+        diagonal: True if no class couples components of ν by inertia or viscosity.
+        damped: True if there is any viscosity.
+
+    Raises:
+        BodyError: if a body's inertia is a function (explicit integrators cannot take it).
+    """
+
+    def __init__(self, disc: Discretisation, fixed: npt.NDArray[np.bool_]) -> None:
+        bodies = disc.scene.bodies
+        self.n, self.n_u = disc.n, disc.scene.displacement
+        omega = np.array([body.inertia_matrix for body in bodies])
+        eta = np.array([body.viscosity_matrix for body in bodies])
+        rho = disc.density()
+        # A node of one region has that region's matrices to the bit; others their own averages.
+        pure = disc.region_volume.max(axis=1) == disc.volume
+        region = np.where(pure, disc.region_volume.argmax(axis=1), -1)
+        mixed = np.flatnonzero(~pure)
+        label = region.astype(np.int64)
+        label[mixed] = len(bodies) + np.arange(len(mixed))
+        bits = fixed @ (1 << np.arange(self.n, dtype=np.int64))
+        keys = np.stack([label, bits, rho.view(np.int64)], axis=1)
+        _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        self.classes = np.zeros(disc.nodes + 1, np.int32)
+        self.classes[:-1] = inverse.ravel()
+        self.density, self.fixed = rho[first], fixed[first]
+        weight = disc.region_volume[first] / disc.volume[first, None]
+        weight[region[first] >= 0] = 0.0
+        rows = np.flatnonzero(region[first] >= 0)
+        weight[rows, region[first][rows]] = 1.0
+        self.inertia = np.einsum("cr,rij->cij", weight, omega)
+        self.viscosity = np.einsum("cr,rij->cij", weight, eta)
+        self.damped = bool(np.any(eta))
+        off = ~np.eye(disc.scene.descriptor, dtype=bool)
+        self.diagonal = not (np.any(omega[:, off]) or np.any(eta[:, off]))
+        self.pure = region[first] >= 0
+        self._bases = [
+            pencil_basis(o, e) for o, e in zip(self.inertia, self.viscosity, strict=True)
+        ]
+
+    @property
+    def one_rate(self) -> bool:
+        """True if all components of ν of a class have inertia and the same rate η/ρ̄.
+
+        Prescribed components have the rate 0: they move as they are told.
+        """
+        m, d = (np.einsum("cii->ci", a) for a in (self.inertia, self.viscosity))
+        if np.any(m == 0):
+            return False
+        rate = np.where(self.fixed[:, self.n_u :], 0.0, d / m)
+        return bool(np.all(np.ptp(rate, axis=1) <= 1e-14 * np.abs(rate).max(axis=1)))
+
+    def diagonalised(self) -> Diagonal:
+        """Per class a basis of the free components in which inertia and viscosity are diagonal."""
+        count = len(self.density)
+        mass, damping = self.full(self.inertia, self.density), self.full(self.viscosity)
+        vectors = np.tile(np.eye(self.n), (count, 1, 1))
+        m, d = np.einsum("cii->ci", mass).copy(), np.einsum("cii->ci", damping).copy()
+        if not self.diagonal:
+            for c, fixed in enumerate(self.fixed):
+                free = self.n_u + np.flatnonzero(~fixed[self.n_u :])
+                if free.size:
+                    ix = np.ix_(free, free)
+                    vectors[c][ix], m[c, free], d[c, free] = pencil_basis(
+                        mass[c][ix], damping[c][ix]
+                    )
+        return Diagonal(vectors, np.linalg.inv(vectors), m, d)
+
+    def full(self, nu: Array, u: Array | None = None) -> Array:
+        """(classes, n, n) with ``nu`` (classes, k, k) in its block and ``u`` (classes,) before."""
+        out = np.zeros((len(nu), self.n, self.n))
+        out[:, self.n_u :, self.n_u :] = nu
+        if u is not None:
+            out[:, range(self.n_u), range(self.n_u)] = u[:, None]
+        return out
+
+    def effective(self, h: float, scheme: str) -> Array:
+        """M̂ of every class for the step h, shape (classes, n, n)."""
+        blocks = np.zeros_like(self.inertia)
+        for c, (vectors, m, d) in enumerate(self._bases):
+            if scheme == "symmetric" or not self.damped:
+                effective(m, d, h, scheme)  # refuses missing inertia
+                blocks[c] = self.inertia[c]
+            elif scheme == "forward":
+                blocks[c] = self.inertia[c] + 0.5 * h * self.viscosity[c]
+            else:
+                back = np.linalg.inv(vectors)
+                blocks[c] = back.T @ np.diag(effective(m, d, h, scheme)) @ back
+        return self.full(blocks, self.density)
+
+    def recursion(self, h: float, scheme: str) -> Recursion:
+        """Everything a step of length h needs, per class.
+
+        Raises:
+            IntegratorError: for an unknown scheme, or one that cannot take missing inertia.
+        """
+        if scheme not in SCHEMES:
+            raise IntegratorError(f"dissipation is {scheme!r}. Give one of {', '.join(SCHEMES)}.")
+        mean = self.effective(h, scheme)
+        D, M = self.full(self.viscosity), self.full(self.inertia, self.density)
+        plus, minus = mean + 0.5 * h * D, mean - 0.5 * h * D
+        alpha, beta = np.zeros_like(M), np.zeros_like(M)
+        to_rate, force_to_rate, massless, from_rate = (np.zeros_like(M) for _ in range(4))
+        for c, fixed in enumerate(self.fixed):
+            free = np.flatnonzero(~fixed)
+            ix = np.ix_(free, free)
+            alpha[c] = np.diag(fixed.astype(float))
+            to_rate[c] = from_rate[c] = np.diag(fixed.astype(float))
+            inverse = np.linalg.inv(plus[c][ix]) if free.size else np.zeros((0, 0))
+            beta[c][ix] = h * inverse
+            alpha[c][ix] = inverse @ minus[c][ix]
+            # Rates at a step's own time: M q̇ = M̂v − (hD/2)v + (h/2) f; without inertia D q̇ = f.
+            m, d = M[c][ix], D[c][ix]
+            if np.linalg.matrix_rank(m, tol=1e-13 * max(np.abs(m).max(initial=0), 1e-300)) == len(
+                free
+            ):
+                back = np.linalg.inv(m) if free.size else m
+                to_rate[c][ix], force_to_rate[c][ix] = back @ minus[c][ix], 0.5 * h * back
+            else:
+                to_rate[c][ix], force_to_rate[c][ix], massless[c][ix] = _first_order(
+                    m, d, minus[c][ix], h
+                )
+            from_rate[c][ix] = inverse @ m
+        return Recursion(alpha, beta, mean, D, M, to_rate, force_to_rate, massless, from_rate)
+
+    def pack(self, matrices: Array, record: int) -> Array:
+        """Matrices as the C loops read them: diagonals (classes, NR), or blocks (classes, n, n)."""
+        from complexbody import native
+
+        if not self.diagonal:
+            return np.ascontiguousarray(matrices)
+        out = native.aligned((len(matrices), record))
+        out[:, : self.n] = np.einsum("cii->ci", matrices)
+        return out
+
+
+def _first_order(m: Array, d: Array, minus: Array, h: float) -> tuple[Array, Array, Array]:
+    """Rates where some components have no inertia: those obey D q̇ = f, the others momentum."""
+    V, mm, dd = pencil_basis(m, d)
+    inertial = mm > 0
+    inverse_m = np.where(inertial, 1.0 / np.where(inertial, mm, 1.0), 0.0)
+    inverse_d = np.where(inertial, 0.0, 1.0 / np.where(dd > 0, dd, 1.0))
+    back_m = V @ np.diag(inverse_m) @ V.T
+    back_d = V @ np.diag(inverse_d) @ V.T
+    return back_m @ minus, 0.5 * h * back_m + back_d, back_d

@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What a run would do, without running it: is the energy coercive, what limits the step, how long.
+
+For ``complexbody check``. Everything is measured on the scene itself: the cells' own critical steps
+and a few timed steps.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.ledger import Bookkeeper
+from complexbody.problem import Problem
+from complexbody.timesets import cell_steps
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The cells' own critical steps [s], of all ranks.
+
+    Attributes:
+        smallest, median, largest: Of the cells that have a finite one.
+        slow: Number of cells whose step is below half the median.
+        worst: Midpoint of the cell with the smallest [m].
+        uniform, local: Cell updates per second of simulated time with one step for all cells, and
+            if each cell took its own.
+    """
+
+    smallest: float
+    median: float
+    largest: float
+    slow: int
+    worst: tuple[float, ...]
+    uniform: float
+    local: float
+
+
+def limits(problem: Problem, dissipation: str) -> Limits:
+    """What limits the step of a scene; collective.
+
+    Raises:
+        StepError: if a cell's stiffness is not finite.
+    """
+    disc, comm = problem.disc, problem.comm
+    steps = cell_steps(problem, dissipation)
+    finite = np.isfinite(steps)
+    mine = steps[finite]
+    parts = comm.gather(mine)
+    least, where = np.inf, (0.0,) * disc.dim
+    if mine.size:
+        block, lane = np.unravel_index(np.argmin(np.where(finite, steps, np.inf)), steps.shape)
+        corners = disc.position[disc.cells[block, :, lane], : disc.dim]
+        least, where = float(steps[block, lane]), tuple(corners.mean(axis=0).tolist())
+    least, where = min(comm.allgather((least, where)))
+    found: Limits | None = None
+    if parts is not None:
+        every = np.concatenate(parts)
+        if every.size:
+            median = float(np.median(every))
+            slow = int(np.sum(every < 0.5 * median))
+            sums = len(every) / least, float(np.sum(1.0 / every))
+            found = Limits(least, median, float(every.max()), slow, where, *sums)
+        else:
+            found = Limits(np.inf, np.inf, np.inf, 0, where, 0.0, 0.0)
+    return comm.bcast(found)
+
+
+def smallest_eigenvalue(problem: Problem, number: int) -> float | None:
+    """Smallest relative eigenvalue of region ``number``'s Hessian on (sym U, ν, N); collective.
+
+    Relative: every row and column is scaled by the root of its diagonal, as A1 is checked.
+
+    Returns:
+        The eigenvalue, or None for an energy that is not quadratic.
+    """
+    n_u, n, dim = problem.scene.displacement, problem.disc.n, problem.disc.dim
+    samples = problem.hessian_samples(number)
+    least = np.inf
+    if len(samples):
+        seen = np.abs(samples).max(axis=(0, 2)) > 0
+        keep = [3 * i + j for i in range(n) for j in range(dim)]
+        keep += [i for i in range(3 * n + n_u, 4 * n) if seen[i]]
+        h = samples[:, keep][:, :, keep]
+        d = np.sqrt(np.abs(np.einsum("mii->mi", h)))
+        d = np.where(d > 0, d, d.max(axis=1, keepdims=True, initial=1e-300))
+        for scaled, scale in zip(h / (d[:, :, None] * d[:, None, :]), d, strict=True):
+            basis = _strains(keep, scale, min(n_u, dim))
+            least = min(least, float(np.linalg.eigvalsh(basis.T @ scaled @ basis)[0]))
+    least = problem.comm.allreduce(least, op=MPI.MIN)
+    return float(least) if np.isfinite(least) else None
+
+
+def _strains(keep: list[int], scale: Array, dim: int) -> Array:
+    """Orthonormal basis of what is no rigid rotation, shape (kept, kept − rotations)."""
+    rotations = np.zeros((len(keep), dim * (dim - 1) // 2))
+    for column, (i, j) in enumerate(itertools.combinations(range(dim), 2)):
+        rotations[keep.index(3 * i + j), column] = 1.0
+        rotations[keep.index(3 * j + i), column] = -1.0
+    left, _, _ = np.linalg.svd(rotations * scale[:, None], full_matrices=True)
+    return left[:, rotations.shape[1] :]
+
+
+def seconds_per_step(run: SynchronousRun, comm: Any, budget: float = 0.3) -> float:
+    """Wall time of one step of the slowest rank [s], by timing some; collective."""
+    run.advance(2)
+    count = 1
+    while True:
+        comm.Barrier()
+        begun = time.perf_counter()
+        run.advance(count)
+        spent = comm.allreduce(time.perf_counter() - begun, op=MPI.MAX)
+        if spent > budget / 3 or count >= 100_000:
+            return float(spent / count)
+        count *= 4
+
+
+def seconds_per_row(books: Bookkeeper, comm: Any) -> float:
+    """Wall time of one ledger row of the slowest rank [s]; collective.
+
+    Raises:
+        DivergenceError: if the energy is not finite.
+    """
+    books.row()
+    begun = time.perf_counter()
+    books.row()
+    return float(comm.allreduce(time.perf_counter() - begun, op=MPI.MAX))

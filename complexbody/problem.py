@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""A scene made ready to run: its forms, arrays, kernels, masses, supports, loads, initial state.
+
+Every integrator starts from a :class:`Problem`. Checks of the user's input that need arrays are
+made here, on all ranks together and before any stepping.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import warnings
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+
+from complexbody import _compat, boundary, hessian, native
+from complexbody.action import Action
+from complexbody.discretisation import Discretisation
+from complexbody.errors import agree
+from complexbody.kernels.library import Kernels
+from complexbody.masses import Masses
+from complexbody.scene import FIELDS, Scene
+
+Array = npt.NDArray[np.float64]
+
+
+class Problem:
+    """A scene with everything an explicit integrator needs; collective.
+
+    Attributes:
+        scene, action, disc, kernels, masses: The layers below.
+        supports, loads: In geometry nodes.
+        moving: (node, component) of supports that move, sorted by node; own numbering.
+        load_position, load_group, load_value: Entries of load vectors in flat node records.
+        warnings: What A1 leaves to the boundary data, in words.
+
+    Raises:
+        SceneError, MeshError, BodyError, CoercivityError: for input that cannot be run.
+    """
+
+    disc: Discretisation
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene, self.comm = scene, scene.mesh.comm
+        self.action = Action(scene)
+        dofs = _compat.cell_dofs(self.action.space)
+        # All layers below rely on one numbering of nodes and P1 degrees of freedom.
+        assert np.array_equal(dofs, _compat.cell_nodes(scene.mesh))
+        self.supports = boundary.supports(scene, self.action)
+        self.loads = boundary.loads(scene, self.action)
+        self._start = boundary.initial(scene, self.action)
+        self.arrange()
+        self.warnings = self._check_energy()
+
+    def arrange(self, group: npt.NDArray[np.int64] | None = None) -> None:
+        """Lay out cells and nodes (anew), cells of one block being of one group; collective.
+
+        Args:
+            group: A whole number per owned cell, or None for one group.
+        """
+        scene = self.scene
+        if hasattr(self, "disc"):
+            self.disc.halo.close()
+        moving = self.supports.moving
+        self.disc = Discretisation(scene, np.flatnonzero(moving.any(axis=1)), group)
+        disc = self.disc
+        self.kernels = Kernels(self.action, disc)
+        fixed = self.supports.fixed[disc.dof]
+        self.masses = Masses(disc, fixed)
+        rows, columns = np.nonzero(moving[disc.dof])
+        self.moving = rows.astype(np.int64), columns.astype(np.int32)
+        number = disc.number
+        self.load_position = number[self.loads.node] * disc.record + self.loads.component
+        self.load_group, self.load_value = self.loads.group, self.loads.value
+        self._initial(*self._start, fixed)
+
+    def _initial(self, fields: Array, rates: Array, fixed: Any) -> None:
+        disc, sup = self.disc, self.supports
+        x0, v0 = disc.gather(fields), disc.gather(rates)
+        rows, columns = np.nonzero(fixed)
+        dofs = disc.dof[rows]
+        x0[rows, columns] = sup.targets(dofs, columns, 0.0)
+        v0[rows, columns] = 0.0
+        self.initial_fields, self.initial_rates = x0, v0
+
+    def targets(self, t: float) -> Array:
+        """Prescribed values of the moving components at time t, in the order of ``moving``."""
+        rows, columns = self.moving
+        return self.supports.targets(self.disc.dof[rows], columns, t)
+
+    def rates_at_start(self, tick: float) -> Array:
+        """Initial rates (nodes, n), prescribed motions by a one-sided second-order difference."""
+        rates = self.initial_rates.copy()
+        if len(self.moving[0]):
+            now, one, two = (self.targets(i * tick) for i in range(3))
+            rates[self.moving] = (-3 * now + 4 * one - two) / (2 * tick)
+        return rates
+
+    def hessian_samples(self, number: int) -> Array:
+        """H of ρe of region ``number`` at its distinct coefficients, shape (samples, 4n, 4n).
+
+        A density that is not quadratic gives no sample: its Hessian depends on the state.
+        """
+        n = self.disc.n
+        stored, d = self.kernels.densities.stored[number], self.kernels.densities
+        if stored is None or not d.generated[number]:
+            return np.zeros((0, 4 * n, 4 * n))
+        samples = np.zeros((1, len(d.coefficients)))
+        if stored.expressions():
+            blocks = self.kernels.coefficients[self.disc.region == number]
+            real = self.disc.source_cell[self.disc.region == number] >= 0
+            samples = np.unique(blocks.transpose(0, 2, 1)[real], axis=0)
+        out = np.zeros((len(samples), 4 * n, 4 * n))
+        for (i, j), value in stored.hessian.items():
+            if isinstance(value, float):
+                out[:, i, j] = value
+            else:
+                out[:, i, j] = samples[:, d.coefficients.index(value)]
+        return out
+
+    def _check_energy(self) -> list[str]:
+        """A1 for every quadratic region; semidefinite modes are warned of on rank 0."""
+        scene, notes = self.scene, []
+        error: Exception | None = None
+        for r, body in enumerate(scene.bodies):
+            samples = self.hessian_samples(r)
+            if not len(samples):
+                continue
+            try:
+                modes = hessian.check_coercive(
+                    samples, scene.displacement, scene.descriptor, self.disc.dim, body.name
+                )
+            except Exception as found:
+                error = found
+                continue
+            for mode in modes:
+                notes.append(
+                    f"The energy of {body.name} does not see the mode {mode}: only inertia, "
+                    "supports or loads hold it."
+                )
+        agree(self.comm, error)
+        # Coefficients differ between ranks, and so may what they leave free.
+        notes = list(dict.fromkeys(note for part in self.comm.allgather(notes) for note in part))
+        if self.comm.rank == 0:
+            for note in notes:
+                warnings.warn(note, UserWarning, stacklevel=2)
+        return notes
+
+    def load_forces(self, amplitude: Array) -> None:
+        """f += loads with the given factors per group (partial, before the halo's sum)."""
+        if len(self.load_value):
+            self.kernels.c.cb_add_loads(
+                ctypes.c_int64(len(self.load_value)), native.pointer(self.load_position),
+                native.pointer(self.load_group), native.pointer(self.load_value),
+                native.pointer(amplitude), native.pointer(self.kernels.f),
+            )  # fmt: skip
+
+    def load_power(self, amplitude: Array, rates: Array) -> float:
+        """Power of this rank's partial loads on rates in node records [W]."""
+        if not len(self.load_value):
+            return 0.0
+        return float(
+            self.kernels.c.cb_power(
+                ctypes.c_int64(len(self.load_value)), native.pointer(self.load_position),
+                native.pointer(self.load_group), native.pointer(self.load_value),
+                native.pointer(amplitude), native.pointer(rates),
+            )
+        )  # fmt: skip
+
+    def functions(self, fields: Array, rates: Array) -> dict[str, fem.Function]:
+        """dolfinx Functions u, nu, u_dot, nu_dot from node records; collective."""
+        out: dict[str, fem.Function] = {}
+        for values, suffix in ((fields, ""), (rates, "_dot")):
+            for name in FIELDS:
+                columns = self.scene.components_of(name)
+                function = fem.Function(
+                    _compat.vector_space(self.scene.mesh, len(columns)), name=name + suffix
+                )
+                self.disc.scatter(np.ascontiguousarray(values[:, columns]), function)
+                out[name + suffix] = function
+        return out
+
+    def close(self) -> None:
+        """Free communicators and requests."""
+        self.disc.halo.close()

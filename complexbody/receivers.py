@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What probes record during a run: (u, ν) at points every few steps, in memory and as CSV.
+
+Rows reach the files whenever the ledger is written, so that a run that is stopped keeps them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from complexbody.discretisation import Discretisation
+from complexbody.files import CsvWriter
+from complexbody.output import Output
+from complexbody.probes import Probes
+from complexbody.scene import Scene
+
+Array = npt.NDArray[np.float64]
+
+
+class Receivers:
+    """Probes of a run; opened, recorded, flushed and closed collectively.
+
+    Args:
+        scene: The scene.
+        output: Names the probes and the folder.
+        disc: The arrays whose node records are probed.
+
+    Raises:
+        SceneError: for points outside the body.
+        OutputError: if the tables cannot be written.
+    """
+
+    def __init__(self, scene: Scene, output: Output, disc: Discretisation) -> None:
+        self.probes, self.n, self.n_u = Probes(scene, output.probes), disc.n, scene.displacement
+        self.names, self.stride, self.comm = list(output.probes), output.probe_steps, disc.comm
+        self._nodes = disc.number[self.probes.cells_nodes]
+        self._rows: list[Array] = []
+        self._times: list[float] = []
+        self._done: list[Array] = []  # on rank 0: (rows, 1 + probes · n)
+        labels = [f"u{j + 1}" for j in range(self.n_u)]
+        labels += [f"nu{j + 1}" for j in range(self.n - self.n_u)]
+        columns = {"time": "s", **{a: "" if a.startswith("nu") else "m" for a in labels}}
+        folder = Path(output.folder)
+        self._tables = [
+            CsvWriter(folder / f"probe-{m}.csv", columns, self.comm) for m in self.names
+        ]
+
+    def record(self, time: float, positions: Array) -> None:
+        """Note the values at ``time`` [s] from node records (nodes, at least n)."""
+        values = positions[self._nodes][..., : self.n]
+        self._rows.append(np.einsum("pa,pan->pn", self.probes.weights, values))
+        self._times.append(time)
+
+    def flush(self) -> None:
+        """Bring what was recorded to rank 0 and to the files; collective."""
+        count, mine = len(self._times), len(self.probes.indices)
+        rows = np.array(self._rows).reshape(count, mine, self.n).transpose(1, 0, 2)
+        every = self.probes.gather(rows.reshape(mine, count * self.n))
+        times = np.array(self._times)
+        self._rows, self._times = [], []
+        block = np.zeros((0, 0))
+        if every is not None:
+            block = every.reshape(len(self.names), count, self.n)
+            whole = np.concatenate([times[:, None], *block], axis=1)
+            self._done.append(whole)
+        for i, table in enumerate(self._tables):
+            rows_out = np.column_stack([times, block[i]]).tolist() if every is not None else []
+            table.write(rows_out)
+
+    def table(self) -> dict[str, dict[str, Any]]:
+        """{name: {"time", "u", "nu"}} of all rows so far on rank 0, empty elsewhere."""
+        if self.comm.rank != 0 or not self._done:
+            return {}
+        data = np.concatenate(self._done)
+        out = {}
+        for i, name in enumerate(self.names):
+            values = data[:, 1 + i * self.n : 1 + (i + 1) * self.n]
+            u, nu = values[:, : self.n_u], values[:, self.n_u :]
+            out[name] = {"time": data[:, 0], "u": u, "nu": nu}
+        return out
+
+    def close(self) -> None:
+        """Close the files."""
+        for table in self._tables:
+            table.close()

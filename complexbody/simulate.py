@@ -1,0 +1,338 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""One simulation, from scene to result: steps, output at chosen times, ledger, probes, progress.
+
+The run never changes its step to meet an output time: what is written at t between two steps is
+the cubic Hermite interpolant of fields and rates, whose error is of higher order than the scheme's.
+"""
+
+from __future__ import annotations
+
+import time as clock
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from dolfinx import fem
+from mpi4py import MPI
+
+from complexbody.errors import SceneError
+from complexbody.files import CsvWriter
+from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.entries import Run
+from complexbody.integrators.synchronous import Synchronous
+from complexbody.ledger import Bookkeeper, Ledger
+from complexbody.output import Output, Writer
+from complexbody.problem import Problem
+from complexbody.progress import Progress
+from complexbody.receivers import Receivers
+from complexbody.scene import Scene
+from complexbody.timesets import require_constant_inertia
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass
+class Statistics:
+    """What a run cost.
+
+    Attributes:
+        step, critical: Step and critical step [s]; steps: number of steps.
+        cells, nodes: Of the whole body; ranks: processes.
+        updates: Cell updates of all ranks; rate: per second of stepping.
+        set_up, stepping, booking, writing: Seconds of the slowest rank.
+        bytes_per_cell: Memory beside dolfinx's own mesh.
+    """
+
+    step: float = 0.0
+    critical: float = 0.0
+    steps: int = 0
+    cells: int = 0
+    nodes: int = 0
+    ranks: int = 1
+    updates: int = 0
+    rate: float = 0.0
+    set_up: float = 0.0
+    stepping: float = 0.0
+    booking: float = 0.0
+    writing: float = 0.0
+    bytes_per_cell: float = 0.0
+
+
+@dataclass
+class Result:
+    """A finished run: fields at the final time, ledger, probes, statistics.
+
+    Attributes:
+        u, nu, u_dot, nu_dot: dolfinx Functions, all at ``time`` [s].
+        ledger: Energies and momenta; ``ledger["stored"]`` is a column.
+        probes: {name: {"time": (m,), "u": (m, n_u), "nu": (m, k)}} on rank 0, empty elsewhere.
+        stats: What it cost.
+        scene: What was simulated; folder: where output went, or None.
+    """
+
+    u: fem.Function
+    nu: fem.Function
+    u_dot: fem.Function
+    nu_dot: fem.Function
+    time: float
+    ledger: Ledger
+    stats: Statistics
+    scene: Scene
+    probes: dict[str, dict[str, Array]] = field(default_factory=dict)
+    folder: Path | None = None
+
+
+def simulate(
+    scene: Scene,
+    integrator: Synchronous | AVI | None = None,
+    *,
+    until: float,
+    output: Output | None = None,
+    ledger_steps: int | None = None,
+    growth: float | None = 10.0,
+    progress: bool | None = None,
+) -> Result:
+    """Run a scene from t = 0 to ``until``; collective.
+
+    Args:
+        scene: What to simulate.
+        integrator: How; ``Synchronous()`` by default.
+        until: End of the run [s].
+        output: What to write and where; nothing by default.
+        ledger_steps: Steps between two ledger rows; by default so many that the books cost some
+            per cent of the run, but at least a hundred rows.
+        growth: Stop when energy from nowhere exceeds this multiple of what was put in; None: never.
+        progress: Show progress on rank 0; by default where standard error is a terminal.
+
+    Returns:
+        Fields at the final time, ledger, probes and statistics.
+
+    Raises:
+        ComplexBodyError: of a kind that says what is wrong, on all ranks.
+    """
+    return Simulation(
+        scene, integrator, until=until, output=output, ledger_steps=ledger_steps, growth=growth,
+        progress=progress,
+    ).run()  # fmt: skip
+
+
+class Simulation:
+    """A simulation that is ready to run: what :func:`simulate` makes and runs; same arguments.
+
+    Attributes:
+        problem, run_: The scene made ready, and the integrator's run.
+        every: Steps between two ledger rows.
+        stats: Filled in as far as known before the run.
+    """
+
+    stats: Statistics
+
+    def __init__(
+        self,
+        scene: Scene,
+        integrator: Synchronous | AVI | None = None,
+        *,
+        until: float,
+        output: Output | None = None,
+        ledger_steps: int | None = None,
+        growth: float | None = 10.0,
+        progress: bool | None = None,
+    ) -> None:
+        begun = clock.perf_counter()
+        if not (np.isfinite(until) and until > 0):
+            raise SceneError(
+                f"simulate: until is {until}. Give the end of the run in seconds, > 0."
+            )
+        if ledger_steps is not None and ledger_steps < 1:
+            raise SceneError(f"simulate: ledger_steps is {ledger_steps}. Give 1 or more.")
+        method = integrator or Synchronous()
+        self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
+        require_constant_inertia(scene, type(method).__name__)
+        self.problem = Problem(scene)
+        self.run_: Run = method.prepare(self.problem, until)
+        self.last = int(np.ceil(until / self.run_.step - 1e-9))
+        # Now that nothing refuses the run: it replaces what an earlier one wrote.
+        self.writer = Writer(self.problem.action, output) if output is not None else None
+        self.books = Bookkeeper(self.problem, self.run_, growth)
+        self.times = output.schedule(until) if output is not None else np.zeros(0)
+        start = self.problem.initial_fields, self.problem.initial_rates
+        self.functions = self.problem.functions(*start)
+        self.receivers: Receivers | None = None
+        self.csv: CsvWriter | None = None
+        if output is not None:
+            if output.probes:
+                self.receivers = Receivers(scene, output, self.problem.disc)
+            ledger = self.books.ledger
+            columns = dict(zip(ledger.columns, ledger.units(), strict=True))
+            self.csv = CsvWriter(Path(output.folder) / "ledger.csv", columns, self.comm)
+        self.progress = Progress(self.comm, until, progress)
+        self._statistics()
+        self.every = ledger_steps or default_ledger_steps(
+            self.stats.cells, self.comm.size, self.last
+        )
+        self.stats.set_up = clock.perf_counter() - begun
+
+    def _statistics(self) -> None:
+        disc = self.problem.disc
+        self.stats = Statistics(self.run_.step, self.run_.critical, ranks=self.comm.size)
+        self.stats.cells = self.comm.allreduce(int(np.sum(disc.source_cell >= 0)))
+        self.stats.nodes = self.comm.allreduce(int(disc.owned.sum()))
+        self.stats.bytes_per_cell = self.problem.kernels.bytes_per_cell()
+
+    def run(self) -> Result:
+        """Run it; collective, once.
+
+        Raises:
+            DivergenceError: if the run blew up.
+            OutputError: if results cannot be written any more.
+        """
+        try:
+            self._loop()
+            return self._result()
+        finally:
+            self._close()
+
+    # --- the loop ------------------------------------------------------------------------------
+
+    def _loop(self) -> None:
+        run = self.run_
+        tiny = 1e-9 * run.step
+        pending = [t for t in self.times if t < self.until - tiny]
+        self._note()
+        while pending and pending[0] <= tiny:
+            self._write(pending.pop(0), *run.sample())
+        while run.steps < self.last:
+            stop = min(self.last, (run.steps // self.every + 1) * self.every)
+            if self.receivers is not None:
+                stride = self.receivers.stride
+                stop = min(stop, (run.steps // stride + 1) * stride)
+            if pending:
+                stop = min(stop, int(np.floor(pending[0] / run.step + 1e-9)))
+            if stop > run.steps:
+                self._advance(stop - run.steps)
+                self._note()
+            if pending and pending[0] < (run.steps + 1) * run.step - tiny:
+                pending = self._between(pending, tiny)
+        self.progress.update(self.until, run.steps)
+
+    def _advance(self, steps: int) -> None:
+        begun = clock.perf_counter()
+        # In pieces of about a second, so that progress and signals are seen in long stretches.
+        piece = max(1, 50_000_000 // max(self.stats.cells // self.comm.size, 1))
+        while steps > 0:
+            self.run_.advance(min(piece, steps))
+            steps -= piece
+        self.stats.stepping += clock.perf_counter() - begun
+        self.progress.update(self.run_.time, self.run_.steps)
+
+    def _note(self) -> None:
+        """Ledger and probes, where the run's step is due for them."""
+        run = self.run_
+        if self.receivers is not None and run.steps % self.receivers.stride == 0:
+            self.receivers.record(run.time, run.positions())
+        if run.steps % self.every == 0 and run.steps < self.last:
+            self._book()
+
+    def _between(self, pending: list[float], tiny: float) -> list[float]:
+        """Write all times due before the next step's end, by Hermite interpolation."""
+        run = self.run_
+        x, rates = run.sample()
+        x0, v0, t0 = x.copy(), rates.copy(), run.time
+        while pending and pending[0] <= t0 + tiny:
+            self._write(pending.pop(0), x0, v0)
+        if not pending or pending[0] >= t0 + run.step - tiny:
+            return pending
+        self._advance(1)
+        x1, v1 = run.sample()
+        while pending and pending[0] < run.time - tiny:
+            t = pending.pop(0)
+            self._write(t, *hermite((t - t0) / run.step, run.step, x0, v0, x1, v1))
+        self._note()
+        return pending
+
+    def _final(self) -> tuple[Array, Array]:
+        """Fields and rates at ``until``; interpolated if a given step does not divide it."""
+        run = self.run_
+        x1, v1 = run.sample()
+        if abs(run.time - self.until) <= 1e-9 * run.step:
+            return x1, v1
+        # One step too far: the last interval is interpolated by its end and the drift before it.
+        h, kernels = run.step, self.problem.kernels
+        x0 = x1 - h * kernels.v
+        v0 = 2 * kernels.v - v1
+        return hermite((self.until - run.time + h) / h, h, x0, v0, x1, v1)
+
+    def _result(self) -> Result:
+        self._book()
+        x, rates = self._final()
+        if self.writer is not None:
+            self._write(self.until, x, rates)
+        self._fill(x, rates)
+        f, s = self.functions, self.stats
+        s.steps = self.run_.steps
+        s.updates = self.comm.allreduce(int(self.run_.updates))
+        for name in ("set_up", "stepping", "booking", "writing"):
+            setattr(s, name, self.comm.allreduce(getattr(s, name), op=MPI.MAX))
+        s.rate = s.updates / max(s.stepping, 1e-12)
+        folder = Path(self.output.folder) if self.output is not None else None
+        probes = self.receivers.table() if self.receivers is not None else {}
+        fields = (f["u"], f["nu"], f["u_dot"], f["nu_dot"])
+        return Result(*fields, self.until, self.books.ledger, s, self.scene, probes, folder)
+
+    # --- what leaves the run -------------------------------------------------------------------
+
+    def _fill(self, x: Array, rates: Array) -> None:
+        nodes = self.problem.disc.nodes
+        for values, suffix in ((x, ""), (rates, "_dot")):
+            for name in ("u", "nu"):
+                columns = self.scene.components_of(name)
+                part = np.ascontiguousarray(values[:nodes, columns])
+                self.problem.disc.scatter(part, self.functions[name + suffix])
+
+    def _write(self, t: float, x: Array, rates: Array) -> None:
+        begun = clock.perf_counter()
+        if self.writer is not None:
+            self._fill(x, rates)
+            self.writer.write(t, self.functions)
+        self.stats.writing += clock.perf_counter() - begun
+
+    def _book(self) -> None:
+        begun = clock.perf_counter()
+        rows = len(self.books.ledger)
+        try:
+            self.books.row()
+        finally:
+            # The row that stops a run is the one a user wants to see.
+            new = self.books.ledger.rows[rows:]
+            if self.csv is not None:
+                self.csv.write(new)
+            if self.receivers is not None:
+                self.receivers.flush()
+        self.stats.booking += clock.perf_counter() - begun
+
+    def _close(self) -> None:
+        self.progress.close()
+        for thing in (self.writer, self.csv, self.receivers):
+            if thing is not None:
+                thing.close()
+        self.problem.close()
+
+
+def default_ledger_steps(cells: int, ranks: int, steps: int) -> int:
+    """Steps between ledger rows: a row costs two steps and the time of some 25 000 cell updates.
+
+    At most some five per cent of a run goes into the books, unless it has less than 100 rows.
+    """
+    cheap = 40 + int(5e5 / max(cells / ranks, 1))
+    return max(1, min(cheap, steps // 100))
+
+
+def hermite(s: float, h: float, x0: Array, v0: Array, x1: Array, v1: Array) -> tuple[Array, Array]:
+    """Cubic through (x0, v0) and (x1, v1) a step h apart, at fraction s: position and rate."""
+    a, b = (1 + 2 * s) * (1 - s) ** 2, s * (1 - s) ** 2
+    c, d = s * s * (3 - 2 * s), s * s * (s - 1)
+    position = a * x0 + b * h * v0 + c * x1 + d * h * v1
+    slope = 6 * s * (1 - s)
+    rate = slope * (x1 - x0) / h + (1 - 4 * s + 3 * s * s) * v0 + (3 * s * s - 2 * s) * v1
+    return position, rate

@@ -1,0 +1,38 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Every demo runs at a small size, on all ranks, and passes the check it ends in."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from complexbody.cli import main
+
+DEMOS = Path(__file__).parents[1] / "demos"
+
+#: Demo, parameters that make it small, and a phrase its check must say.
+SMALL = [
+    ("standing_wave.py", ("--set", "cells=32"), "error"),
+    ("standing_wave.py", ("--set", "cells=32", "--set", "dim=1"), "error"),
+    (
+        "impact.py",
+        ("--set", "refine=0.5", "--until", "2.4e-6", "--every", "1.2e-6"),
+        "first pulse at",
+    ),
+]
+
+
+@pytest.mark.parametrize(("demo", "options", "told"), SMALL)
+def test_demo(demo, options, told, comm, shared_path):
+    out = shared_path / "results"
+    assert main(["run", str(DEMOS / demo), *options, "--out", str(out), "--quiet"]) == 0
+    if comm.rank == 0:
+        run = json.loads((out / "run.json").read_text())
+        assert run["state"] == "finished"
+        assert told in run["check"]
+        assert (out / "ledger.csv").stat().st_size > 0
+        assert (out / "u.xdmf").exists()
+
+
+def test_every_demo_is_here():
+    assert {path.name for path in DEMOS.glob("*.py")} == {name for name, *_ in SMALL}

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Files while they grow: read meanwhile, resumed, refused; tables to the last digit."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import subprocess
+import sys
+from contextlib import ExitStack
+
+import numpy as np
+import pytest
+from written import body, domain, fields, read, wavy
+
+from complexbody.action import Action
+from complexbody.errors import OutputError
+from complexbody.files import CsvWriter
+from complexbody.output import Output, Writer
+from complexbody.scene import Scene
+
+WATCH = "import h5py, sys; file = h5py.File(sys.argv[1]); print('open', flush=True); input()"
+
+
+def test_reading_while_writing(comm, shared_path):
+    """Between steps all is complete; who keeps the file open for reading does not stop the run."""
+    pytest.importorskip("h5py")
+    scene = Scene(domain(comm, 2), body())
+    with Writer(Action(scene), Output(shared_path, fields="u")) as writer, ExitStack() as stack:
+        for number in range(3):
+            writer.write(float(number), fields(scene, wavy))
+            if comm.rank == 0:
+                assert len(read(shared_path / "u.xdmf")[2]) == number + 1
+                if number == 0:
+                    command = [sys.executable, "-c", WATCH, shared_path / "u.h5"]
+                    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+                    watcher = subprocess.Popen(command, env=dict(os.environ), **pipes)
+                    stack.callback(watcher.communicate, "enough\n")
+                    assert watcher.stdout.readline() == "open\n"
+    if comm.rank == 0:
+        assert len(read(shared_path / "u.xdmf")[2]) == 3
+
+
+def test_resume_goes_on(comm, shared_path):
+    """What was written up to then stays, what came later is written anew; else all is new."""
+    scene = Scene(domain(comm, 2), body())
+    output = Output(shared_path, fields=["u", "stress"])
+    for resume, begin, times in (
+        (None, 0, [0, 1, 2, 3]),
+        (1.5, 1, [0, 1, 2, 3]),
+        (None, 2, [2, 3]),
+    ):
+        with Writer(Action(scene), output, resume=resume) as writer:
+            for time in range(begin, 4):
+                writer.write(
+                    time, fields(scene, lambda x, i, b=begin, t=time: (10 * b + t) + 0 * x[0])
+                )
+        comm.barrier()
+        if comm.rank == 0:
+            steps = read(shared_path / "u.xdmf")[2]
+            assert [step[0] for step in steps] == times
+            values = [step[2][0, 0] for step in steps]
+            assert values == {0: [0, 1, 2, 3], 1: [0, 1, 12, 13], 2: [22, 23]}[begin]
+            assert len(read(shared_path / "stress.xdmf")[2]) == len(times)
+        comm.barrier()
+    with pytest.raises(OutputError, match="another mesh"):
+        Writer(Action(Scene(domain(comm, 1), body())), output, resume=1.0)
+
+
+def test_unwritable_folders(comm, shared_path):
+    """A file where the folder should be: all ranks say so, before and during the run."""
+    scene = Scene(domain(comm, 2), body())
+    if comm.rank == 0:
+        (shared_path / "file").write_text("in the way")
+    comm.barrier()
+    for place in ("file", "file/results"):
+        with pytest.raises(OutputError, match="cannot be written"):
+            Writer(Action(scene), Output(shared_path / place))
+        with pytest.raises(OutputError, match="cannot be written"):
+            CsvWriter(shared_path / place / "t.csv", {"time": "s"}, comm)
+    writer = Writer(Action(scene), Output(shared_path / "gone"))
+    if comm.rank == 0:
+        shutil.rmtree(shared_path / "gone")
+    comm.barrier()
+    with pytest.raises(OutputError, match="cannot be written"):
+        writer.write(0.0, fields(scene, wavy))
+
+
+def test_a_full_disk(comm, shared_path, monkeypatch):
+    """All ranks say so, before HDF5 breaks; what is there stays readable."""
+    scene = Scene(domain(comm, 2), body())
+    writer = Writer(Action(scene), Output(shared_path, fields="u"))
+    writer.write(0.0, fields(scene, wavy))
+    nearly = shutil.disk_usage(shared_path)._replace(free=1000)
+    with monkeypatch.context() as patch, pytest.raises(OutputError, match="No space left"):
+        patch.setattr(shutil, "disk_usage", lambda path: nearly)
+        writer.write(1.0, fields(scene, wavy))
+    writer.write(2.0, fields(scene, wavy))
+    comm.barrier()
+    assert [step[0] for step in read(shared_path / "u.xdmf")[2]] == [0.0, 2.0]
+
+
+def test_tables(comm, shared_path):
+    """Headers have units, numbers come back to the last digit, rows are there once written."""
+    path = shared_path / "tables" / "ledger.csv"
+    columns = {"time": "s", "steps": "", "energy, total": "J"}
+    rows = [[0.1 + 0.2, 1, np.float64(1) / 3], [1e-300, 2, -np.pi], [5.0, 3, float("nan")]]
+    with CsvWriter(path, columns, comm) as table:
+        for row in rows:
+            table.write([row] if comm.rank == 0 else [])
+            if comm.rank == 0:
+                header, *found = csv.reader(path.read_text().splitlines())
+                assert len(found) == rows.index(row) + 1
+    if comm.rank == 0:
+        assert header == ["time [s]", "steps", "energy, total [J]"]
+        np.testing.assert_array_equal(np.array(found, dtype=float), np.array(rows, dtype=float))
+    comm.barrier()
+    with CsvWriter(path, columns, comm, resume=1.0) as table:
+        table.write([[2.0, 4, 0.0]])
+    if comm.rank == 0:
+        assert [line.split(",")[1] for line in path.read_text().splitlines()[1:]] == ["1", "2", "4"]
+    comm.barrier()
+    with pytest.raises(OutputError, match="other columns"):
+        CsvWriter(path, {"time": "s"}, comm, resume=1.0)
