@@ -31,13 +31,12 @@ void cb_drift(const world *s, int64_t first, int64_t last, double t) {
   }
 }
 
-/* Kicks of shared nodes, collected and summed over ranks, at time t; empties the collection. */
-void cb_apply(const world *s, double t) {
-  for (int64_t a = s->late; a < s->beyond; a++) {
-    double *sum = s->collected + (a - s->late) * NR, *r = record_of(s, a);
-    int any = 0;
-    for (int i = 0; i < N; i++) any |= sum[i] != 0;
-    if (!any) continue;
+/* Kicks of shared nodes, collected and summed over ranks, at time t, for the `count` nodes whose cells
+ * acted on some rank: they drift even if no force comes of it. Empties the collection. */
+void cb_apply(const world *s, double t, const int32_t *rows, int64_t count) {
+  for (int64_t j = 0; j < count; j++) {
+    const int64_t a = s->late + rows[j];
+    double *sum = s->collected + (int64_t)rows[j] * NR, *r = record_of(s, a);
     int32_t some[W];
     for (int l = 0; l < W; l++) some[l] = (int32_t)a;
     drift(s, some, t);

@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 import ctypes
+from typing import TYPE_CHECKING
 
 from complexbody import native
 from complexbody.kernels.ffcx import Tabulated, TabulatedRecord
 from complexbody.kernels.library import Kernels
 from complexbody.kernels.quadratic import RegionSource
 from complexbody.masses import SCHEMES
+
+if TYPE_CHECKING:
+    from complexbody.integrators.asynchronous import AVI
 
 
 def regions(kernels: Kernels) -> list[RegionSource | None]:
@@ -63,24 +67,23 @@ def record_size(components: int, record: int, balanced: bool) -> tuple[int, int,
     return parts * record + 2, parts * record, parts * record + 1
 
 
-def load(kernels: Kernels, balanced: bool, damped: bool, slow: bool, scheme: str) -> ctypes.CDLL:
+def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL:
     """Compile the events of a scene.
 
     Args:
         kernels: The scene's kernels.
-        balanced: Nodes carry a constant acceleration, cells a reference.
+        method: The integrator: balanced or not, its dissipation scheme.
         damped: There is viscosity.
         slow: Components of ν differ in η/ρ̄, lack inertia, or are coupled by Ω or η.
-        scheme: Dissipation scheme.
     """
     disc, scene = kernels.disc, kernels.action.scene
-    count = references(kernels) if balanced else 0
+    count = references(kernels) if method.balanced else 0
     defines = {
         "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
         "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1,
         "COEFFICIENTS": len(kernels.densities.coefficients), "REFERENCES": count,
-        "BALANCED": int(balanced), "DAMPED": int(damped), "SCHEME": SCHEMES.index(scheme),
-        "SLOW": int(slow),
+        "BALANCED": int(method.balanced), "DAMPED": int(damped), "SLOW": int(slow),
+        "SCHEME": SCHEMES.index(method.dissipation),
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
     parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]

@@ -4,7 +4,6 @@
 The reference (windows_reference.py) is the paper's recursion with a heap of events, in numpy.
 """
 
-import ctypes
 import itertools
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -21,7 +20,8 @@ from verification.windows_reference import Quadratic, Quartic, Windows
 
 import complexbody as cb
 from complexbody import _compat, meshes, native
-from complexbody.integrators.asynchronous import AVI, KEEP, AVIRun
+from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.window_run import KEEP, WindowRun
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps, critical_step
 
@@ -597,13 +597,10 @@ def window_map(run):
     out = np.zeros((parts * size, parts * size))
     for j, unit in enumerate(np.eye(parts * size).reshape(-1, parts, size)):
         run.steps = 1
-        for q, kept in ((unit[-1], "_old"), (unit[0], "stress")) if balanced else ():
+        for q, kept in ((unit[-1], "old"), (unit[0], "stress")) if balanced else ():
             put(q, 0.0)
-            run.c.cb_together(
-                run._world, ctypes.c_int64(0), ctypes.c_int64(run.plan.count),
-                ctypes.c_double(run.time), ctypes.c_double(0.0), KEEP,
-            )  # fmt: skip
-            np.copyto(getattr(run, kept), run.stress)
+            run._together(run.time, KEEP, 0.0)
+            np.copyto(getattr(run.balance, kept), run.balance.stress)
         put(unit[0], unit[1])
         run.advance(1)
         out[:size, j] = run.record[rows, columns]
@@ -677,7 +674,7 @@ def two_rates(ratio, safety, viscosity=0.0):
     coarse = corner < float(10 * ratio * length) - 1e-9
     problem.arrange(np.where(coarse, ratio.denominator, ratio.numerator))
     window = safety * float(ratio * length) * ratio.denominator
-    return AVIRun(problem, AVI(balanced=False), window, 1.0)
+    return WindowRun(problem, AVI(balanced=False), window, 1.0)
 
 
 @pytest.mark.serial
