@@ -2,89 +2,161 @@
 """Asynchronous variational integrators: every cell has its own time step (paper §4).
 
 At an event of cell K its nodes drift to t, the force is taken there, and each node is kicked by
-h_K times it: (Discr-dAL1), (Discr-dAL2) with the dissipation's sign corrected. ``balanced`` windows
-act against a smooth reference stress taken at the window's start, whose assembled force drives the
-drifts: neighbouring cells need not cancel each other at different times (DESIGN §5).
+h_K times it: (Discr-dAL1), (Discr-dAL2) with the dissipation's sign corrected. What differs is
+when: at the multiples of any h_K ("exact"), or in windows whose order of events repeats. Windows
+may be ``balanced``: against a smooth reference stress taken at the window's start, whose assembled
+force drives the drifts, neighbouring cells need not cancel each other at different times (DESIGN §5).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
-from complexbody.errors import IntegratorError, StepError
+from complexbody.errors import IntegratorError, StepError, agree
+from complexbody.integrators.exact_run import ExactRun
 from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps
 
+Array = npt.NDArray[np.float64]
+SCHEDULES = ("windows", "exact", "octaves")
+STARTS = ("trapezoidal", "one-sided")
+
 
 @dataclass(frozen=True)
 class AVI:
-    """Asynchronous variational integrator on windows: every cell its own step.
+    """Asynchronous variational integrator: every cell its own step.
 
     Attributes:
         safety: α, the fraction of each cell's critical step it may use. Resonances start near
             0.47 of it on bars of two rates, hence 0.45.
-        schedule: "windows" (N_K = ⌈W/h_K⌉ equal steps per window) or "octaves" (N_K rounded up to a
-            power of two).
+        schedule: "windows" (N_K = ⌈W/h_K⌉ equal steps per window), "octaves" (N_K rounded up to a
+            power of two) or "exact" (any real h_K, events at its multiples).
         balanced: Act against a smoothed reference stress, which removes the error floor of
-            asynchronous stepping; False gives plain windows, an AVI of the paper with rational
-            time sets, symplectic, with the floor.
+            asynchronous stepping; the default on windows. False gives plain windows, an AVI of the
+            paper with rational time sets, symplectic, with the floor. An exact schedule is plain.
         passes: Smoothing passes of the reference (cell → node → cell).
         filter: ε of the filter v −= ε(I − S)³v at window ends (balanced only); 0 is none.
         dissipation: "exact", "symmetric" or "forward", as for Synchronous.
+        start: "trapezoidal" (a cell's first kick is a half, order 2) or "one-sided" (the paper's,
+            order 1; not balanced).
+        corrected: Give each cell the softer potential V_K − (h_K²/24) ∇V_K·M⁻¹∇V_K, which cures
+            most of what a cell that acts alone sees of its own ripple; "exact" only, where it is
+            the default. Still a potential per cell: symplectic, momentum kept.
+        steps: h_K of this rank's cells [s], in the order of dolfinx's owned cells; "exact" only.
+        unstable_ok: Run even with ``steps`` above the cells' critical ones.
 
     Raises:
-        IntegratorError, StepError: for options that make no sense.
+        IntegratorError, StepError: for options that make no sense, or not together.
     """
 
     safety: float = 0.45
     schedule: str = "windows"
-    balanced: bool = True
+    balanced: bool | None = None
     passes: int = 2
     filter: float = 0.01
     dissipation: str = "exact"
+    start: str = "trapezoidal"
+    corrected: bool | None = None
+    steps: Array | None = field(default=None, compare=False)
+    unstable_ok: bool = False
 
     explicit: ClassVar[bool] = True
     asynchronous: ClassVar[bool] = True
-    order: ClassVar[int] = 2
-    inertia: ClassVar[str] = "number, or diagonal matrix; 0 where viscosity is positive"
+    inertia: ClassVar[str] = "number or k×k matrix; 0 where viscosity is positive"
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.safety) and 0 < self.safety):
             raise StepError(f"AVI: safety is {self.safety}. Give a positive number, 0.45 or less.")
-        if self.dissipation not in SCHEMES:
-            raise IntegratorError(
-                f"AVI: dissipation={self.dissipation!r} is not known. Give one of "
-                f"{', '.join(SCHEMES)}."
-            )
-        if self.schedule not in ("windows", "octaves"):
-            raise IntegratorError(
-                f"AVI: schedule={self.schedule!r} is not known. Give 'windows' or 'octaves'."
-            )
+        for name, allowed in (
+            ("dissipation", SCHEMES),
+            ("schedule", SCHEDULES),
+            ("start", STARTS),
+        ):
+            if getattr(self, name) not in allowed:
+                raise IntegratorError(
+                    f"AVI: {name}={getattr(self, name)!r} is not known. Give one of "
+                    f"{', '.join(allowed)}."
+                )
         if self.passes < 1 or self.filter < 0:
             raise IntegratorError("AVI: give passes ≥ 1 and filter ≥ 0.")
+        exact, whole = self.schedule == "exact", self.start == "one-sided"
+        if self.balanced is None:
+            object.__setattr__(self, "balanced", not exact and not whole)
+        if self.corrected is None:
+            object.__setattr__(self, "corrected", exact)
+        for wrong, advice in (
+            (exact and self.balanced, "schedule='exact' has no windows to balance. Use balanced=False"),
+            (whole and self.balanced, "balanced windows kick half at both ends. Use balanced=False, or start='trapezoidal'"),
+            (not exact and self.corrected, "corrected is for cells that act alone. Use schedule='exact'"),
+            (not exact and self.steps is not None, "steps are for schedule='exact'. Use that, or safety"),
+        ):  # fmt: skip
+            if wrong:
+                raise IntegratorError(f"AVI: {advice}.")
+
+    @classmethod
+    def as_published(cls, safety: float = 0.45, steps: Array | None = None) -> AVI:
+        """The paper's scheme: real steps, one-sided start, dissipation (dissdiscr), its sign corrected."""
+        return cls(
+            safety, "exact", dissipation="forward", start="one-sided", corrected=False, steps=steps
+        )
+
+    @property
+    def order(self) -> int:
+        """Order of convergence in the steps."""
+        return 1 if self.dissipation == "forward" or self.start == "one-sided" else 2
 
     @property
     def symplectic(self) -> bool:
-        """Plain windows are; balanced ones only nearly: the reference depends on the state."""
+        """Balanced windows only nearly are: the reference depends on the state."""
         return not self.balanced
 
-    def prepare(self, problem: Problem, until: float) -> WindowRun:
-        """Choose windows and steps, regroup the cells, and set up the run; collective.
+    def prepare(self, problem: Problem, until: float) -> WindowRun | ExactRun:
+        """Choose steps, regroup the cells for windows, and set up the run; collective.
 
         Raises:
             IntegratorError: for bodies this integrator cannot take.
+            StepError: for ``steps`` that are not one per cell, positive, and stable.
         """
         critical = cell_steps(problem, self.dissipation)
         disc = problem.disc
         real = disc.source_cell >= 0
-        steps = np.full(int(real.sum()), np.inf)
-        steps[disc.source_cell[real]] = self.safety * critical[real]
+        own = np.full(disc.count, np.inf)
+        own[disc.source_cell[real]] = critical[real]
+        steps = self.safety * own
+        if self.steps is not None:
+            steps = self._given(problem, own)
         window = window_length(steps, until, problem.comm)
+        if self.schedule == "exact":
+            # A cell without stiffness of its own acts once per span.
+            blocks = np.full(critical.shape, np.inf)
+            blocks[real] = np.minimum(steps, window)[disc.source_cell[real]]
+            return ExactRun(problem, self, window, blocks, own)
         problem.arrange(divisions(steps, window, self.schedule == "octaves"))
-        return WindowRun(problem, self, window, steps / self.safety)
+        return WindowRun(problem, self, window, own)
+
+    def _given(self, problem: Problem, critical: Array) -> Array:
+        """``steps``, if they are fit to run with."""
+        steps, error = np.asarray(self.steps, dtype=np.float64), None
+        if steps.shape != critical.shape:
+            error = StepError(
+                f"AVI: steps has shape {steps.shape}, but this rank owns {len(critical)} cells. "
+                "Give one step for each of them."
+            )
+        elif not (np.isfinite(steps).all() and np.all(steps > 0)):
+            error = StepError("AVI: steps are not all positive and finite. Give seconds, > 0.")
+        elif np.any(steps > critical * (1 + 1e-9)) and not self.unstable_ok:
+            worst = int(np.argmax(steps / critical))
+            error = StepError(
+                f"AVI: the step {steps[worst]:.6g} s of cell {worst} is larger than its critical "
+                f"step {critical[worst]:.6g} s. Give smaller steps (resonances start near 0.47 of "
+                "it), or unstable_ok=True to see what happens."
+            )
+        agree(problem.comm, error)
+        return steps

@@ -96,7 +96,7 @@ class RecordRun:
         self._support_kinetic: Array | None = None
         self._support_force: Array | None = None
         if self._supported:
-            self._support_force = self._forces_now(0.0)[problem.moving]
+            self._support_force = self._forces_at(self.record, 0.0)[problem.moving]
         self._forms = events.Forms(kernels, method.balanced)
         self.world = world = World()
         # Moving supports are late, too, but only shared nodes wait for the other ranks' kicks.
@@ -170,7 +170,7 @@ class RecordRun:
         if not self._supported:
             return
         rows, columns = problem.moving
-        force = self._forces_now(end)[rows, columns]
+        force = self._forces_at(self.positions(), end)[rows, columns]
         if self._support_force is not None:
             rates = self.record[rows, problem.disc.record + columns]
             pull = -0.5 * (force + self._support_force) * rates * self.step
@@ -184,10 +184,10 @@ class RecordRun:
             self._support_kinetic = kinetic
         self._support_force = force
 
-    def _forces_now(self, t: float) -> Array:
-        """All forces at the positions at t, loads included, summed over ranks (nodes, n)."""
+    def _forces_at(self, positions: Array, t: float) -> Array:
+        """All forces at positions (nodes + 1, ≥ n) and t, loads included, summed over ranks."""
         problem, kernels, n = self.problem, self.problem.kernels, self.problem.disc.n
-        kernels.x[:, :n] = self.positions()[:, :n]
+        kernels.x[:, :n] = positions[:, :n]
         kernels.forces()
         problem.load_forces(problem.loads.amplitudes(np.array([t]))[0])
         force = kernels.f[:-1, :n].copy()
@@ -260,7 +260,7 @@ class RecordRun:
     def _follow(self, rates: Array) -> None:
         """Rates of components without inertia: they obey D q̇ = f at any time."""
         problem, n = self.problem, self.problem.disc.n
-        force = self._forces_now(self.time)
+        force = self._forces_at(self.positions(), self.time)
         klass = problem.masses.classes[:-1]
         V, soft = self.basis[klass], self.compliance[klass, :n]
         pull = np.einsum("aji,aj->ai", V, force) / problem.disc.volume[:, None]

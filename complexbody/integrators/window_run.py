@@ -49,8 +49,10 @@ class WindowRun(RecordRun):
         self.world.start = start
         mode = 0 if balance is None else AGAINST
         self._move_supports(start)
+        # One-sided: cells' first kicks are whole, and there are none at the end.
+        whole = self.method.start == "one-sided"
         if balance is None:
-            self._load_kick(start)
+            self._load_kick(start, 1.0 if whole else 0.5)
         else:
             if self.steps == 0:
                 # Nobody has acted yet: a kick of no weight leaves the stress behind.
@@ -58,7 +60,7 @@ class WindowRun(RecordRun):
                 self.updates += self.problem.disc.count
             balance.set(start, self.steps == 0)
             loaded = self._loaded_positions()
-        self._together(start, mode)
+        self._together(start, mode, 1.0 if whole else 0.5)
         if self.problem.comm.size == 1:
             c.cb_replay(
                 self._world, plan.events, ctypes.c_int64(0), ctypes.c_int64(plan.total), mode
@@ -67,9 +69,13 @@ class WindowRun(RecordRun):
             self._replay_cut(mode)
         nodes = ctypes.c_int64(self.problem.disc.nodes)
         c.cb_drift(self._world, ctypes.c_int64(0), nodes, ctypes.c_double(end))
-        self._together(end, mode if balance is None else mode | KEEP)
+        if whole:
+            self.updates -= self.problem.disc.count
+        else:
+            self._together(end, mode if balance is None else mode | KEEP)
         if balance is None:
-            self._load_kick(end)
+            if not whole:
+                self._load_kick(end)
         else:
             # Loads were a constant force: their work is exact.
             amplitude = self.problem.loads.amplitudes(np.array([start + 0.5 * self.step]))[0]

@@ -27,7 +27,7 @@ void cb_drift(const world *s, int64_t first, int64_t last, double t) {
   for (int64_t a = first; a < last; a += W) {
     int32_t some[W];
     for (int l = 0; l < W; l++) some[l] = (int32_t)(a + l < last ? a + l : last - 1);
-    drift(s, some, t);
+    drift(s, some, (vec){0} + t);
   }
 }
 
@@ -39,7 +39,7 @@ void cb_apply(const world *s, double t, const int32_t *rows, int64_t count) {
     double *sum = s->collected + (int64_t)rows[j] * NR, *r = record_of(s, a);
     int32_t some[W];
     for (int l = 0; l < W; l++) some[l] = (int32_t)a;
-    drift(s, some, t);
+    drift(s, some, (vec){0} + t);
     impulse(s, a, sum, r[INVERSE], r + NR);
     memset(sum, 0, NR * sizeof(double));
   }

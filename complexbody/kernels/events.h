@@ -167,19 +167,19 @@ INLINE nvec timed(nvec x, int g, double t) {
   return x;
 }
 
-/* Drift W nodes (which may repeat) to t. */
-INLINE void drift(const world *s, const int32_t *nodes, double t) {
+/* Drift W nodes (which may repeat), each to its own t. */
+INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
 #if SLOW
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);
-    drift_slowly(s, nodes[l], t - r[TIME]);
-    r[TIME] = t;
+    drift_slowly(s, nodes[l], t[l] - r[TIME]);
+    r[TIME] = t[l];
   }
 #elif DAMPED
   vec dt, z, volume;
   for (int l = 0; l < W; l++) {
     const double *r = record_of(s, nodes[l]);
-    dt[l] = t - r[TIME];
+    dt[l] = t[l] - r[TIME];
     z[l] = s->rate[(s->klass ? s->klass[nodes[l]] : 0) * NR + NU];
     volume[l] = s->counted[nodes[l]] ? r[INVERSE] : INFINITY;
   }
@@ -193,7 +193,7 @@ INLINE void drift(const world *s, const int32_t *nodes, double t) {
   memset(lost, 0, sizeof lost);
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);
-    if (r[TIME] == t) continue; /* at rest in time, or a node that comes again */
+    if (r[TIME] == t[l]) continue; /* at rest in time, or a node that comes again */
     nvec *x = (nvec *)r, *v = (nvec *)(r + NR);
     const nvec *eta = (const nvec *)(s->eta + (s->klass ? s->klass[nodes[l]] : 0) * NR);
     for (int g = 0; g < NR / VN; g++) {
@@ -206,10 +206,10 @@ INLINE void drift(const world *s, const int32_t *nodes, double t) {
       const nvec mean = v[g] + nu[g] * ((c[1][l] - 1.0) * v[g]);
       v[g] += nu[g] * ((c[3][l] - 1.0) * v[g]);
 #endif
-      x[g] = timed(x[g] + c[0][l] * mean, g, t);
+      x[g] = timed(x[g] + c[0][l] * mean, g, t[l]);
       lost[g] += weight[l] * eta[g] * mean * mean;
     }
-    if (TIME >= NR) r[TIME] = t;
+    if (TIME >= NR) r[TIME] = t[l];
   }
   double sum = 0;
   for (int i = 0; i < NR; i++) sum += lost[i / VN][i % VN];
@@ -217,24 +217,24 @@ INLINE void drift(const world *s, const int32_t *nodes, double t) {
 #else
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);
-    const double dt = t - r[TIME];
+    const double dt = t[l] - r[TIME];
     nvec *x = (nvec *)r, *v = (nvec *)(r + NR);
     for (int g = 0; g < NR / VN; g++) {
 #if BALANCED
       const nvec a = ((nvec *)(r + 2 * NR))[g];
-      x[g] = timed(x[g] + dt * (v[g] + (0.5 * dt) * a), g, t);
+      x[g] = timed(x[g] + dt * (v[g] + (0.5 * dt) * a), g, t[l]);
       v[g] += dt * a;
 #else
-      x[g] = timed(x[g] + dt * v[g], g, t);
+      x[g] = timed(x[g] + dt * v[g], g, t[l]);
 #endif
     }
-    if (TIME >= NR) r[TIME] = t;
+    if (TIME >= NR) r[TIME] = t[l];
   }
 #endif
 }
 
-/* Drift the nodes of W cells to t and hand out their positions, one component per vector. */
-INLINE void drift_gather(const world *s, const int32_t *c, double t, vec out[NR]) {
+/* Drift the nodes of W cells, each to its own t, and hand out their positions, one component per vector. */
+INLINE void drift_gather(const world *s, const int32_t *c, const vec t, vec out[NR]) {
   drift(s, c, t);
 #if NR >= W
   for (int g = 0; g < NR; g += W) {
@@ -250,7 +250,7 @@ INLINE void drift_gather(const world *s, const int32_t *c, double t, vec out[NR]
 }
 
 /* Kick the nodes of W cells: rate += weight f / (volume m); shared nodes collect. */
-INLINE void kick(const world *s, const int32_t *c, double weight, const vec in[NR]) {
+INLINE void kick(const world *s, const int32_t *c, const vec weight, const vec in[NR]) {
 #if NR >= W && !SLOW
   for (int g = 0; g < NR; g += W) {
     vec f[W];
@@ -272,9 +272,9 @@ INLINE void kick(const world *s, const int32_t *c, double weight, const vec in[N
     const int collect = a >= s->late && a < s->beyond;
     for (int i = 0; i < N; i++) f[i] = in[i][l];
     if (collect)
-      for (int i = 0; i < N; i++) s->collected[(a - s->late) * NR + i] += weight * f[i];
+      for (int i = 0; i < N; i++) s->collected[(a - s->late) * NR + i] += weight[l] * f[i];
     else
-      impulse(s, a, f, weight * r[INVERSE], r + NR);
+      impulse(s, a, f, weight[l] * r[INVERSE], r + NR);
   }
 #endif
 }
@@ -294,7 +294,7 @@ __attribute__((unused)) static void tabulated_event(
     const vec *b = (const vec *)(geometry + m * GEOMETRY * W);
     vec f[DIM + 1][NR];
     memset(f, 0, sizeof f);
-    for (int a = 0; a <= DIM; a++) drift(s, c + a * W, t);
+    for (int a = 0; a <= DIM; a++) drift(s, c + a * W, (vec){0} + t);
     for (int l = 0; l < W && c[l] < s->nodes; l++) {
       if (force->function) {
         tabulated_input(force, first + m, l, c, s->record, RECORD, s->coordinates, w, at);
@@ -324,6 +324,6 @@ __attribute__((unused)) static void tabulated_event(
         f[0][i] += z;
       }
     }
-    for (int a = 0; a <= DIM; a++) kick(s, c + a * W, weight, f[a]);
+    for (int a = 0; a <= DIM; a++) kick(s, c + a * W, (vec){0} + weight, f[a]);
   }
 }

@@ -78,26 +78,44 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
     """
     disc, scene = kernels.disc, kernels.action.scene
     count = references(kernels) if method.balanced else 0
+    exact = method.schedule == "exact"
+    coefficients = len(kernels.densities.coefficients)
     defines = {
         "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
-        "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1,
-        "COEFFICIENTS": len(kernels.densities.coefficients), "REFERENCES": count,
-        "BALANCED": int(method.balanced), "DAMPED": int(damped), "SLOW": int(slow),
-        "SCHEME": SCHEMES.index(method.dissipation),
+        "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1, "COEFFICIENTS": coefficients,
+        "REFERENCES": count, "BALANCED": int(method.balanced), "DAMPED": int(damped),
+        "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
+        "CORRECTED": int(method.corrected), "PACKED": packed_size(kernels),
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
     parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]
-    cases = ""
+    if exact:
+        parts.append(native.template("lone.h"))
+    cases, alone = "", ""
     for r, region in enumerate(regions(kernels)):
+        forms = f"(s)->forms + {2 * r}"
         if region is not None:
-            parts.append(region.event(count))
+            parts += [region.event(count), region.lone(method.corrected) if exact else ""]
             call = f"event_{r}(blocks, c, g, k, held, kept, s, t, w, mode)"
+            lone = f"lone_{r}(s, c, b, k, t, soft, out)"
         else:
-            forms = f"(s)->forms + {2 * r}, (s)->forms + {2 * r + 1}"
-            call = f"tabulated_event({forms}, blocks, first, c, g, held, kept, s, t, w, mode)"
+            arguments = f"{forms}, {forms} + 1, blocks, first, c, g, held, kept, s, t, w, mode"
+            call = f"tabulated_event({arguments})"
+            lone = f"tabulated_lone({forms}, s, c, cell, t, soft, count, out)"
         cases += f"case {r}: {call}; break; "
+        alone += f"case {r}: {lone}; break; "
     arguments = "region, blocks, first, c, g, k, held, kept, s, t, w, mode"
     parts.append(f"#define EVENT({arguments}) switch (region) {{ {cases}}}")
-    library = native.load("\n".join([*parts, native.template("events.c")]))
+    arguments = "region, s, c, cell, b, k, t, soft, count, out"
+    parts.append(f"#define LONE({arguments}) switch (region) {{ {alone}}}")
+    parts.append(native.template("events.c"))
+    library = native.load("\n".join([*parts, native.template("exact.c") if exact else ""]))
     library.cb_change_rates.restype = ctypes.c_double
     return library
+
+
+def packed_size(kernels: Kernels) -> int:
+    """Doubles per cell of an exact schedule: geometry, coefficients, step, nodes; whole vectors."""
+    disc = kernels.disc
+    used = disc.dim**2 + 1 + len(kernels.densities.coefficients) + 1 + -(-(disc.dim + 1) // 2)
+    return -(-used // disc.lanes) * disc.lanes

@@ -184,7 +184,8 @@ class RegionSource:
             references: Reference values per cell: n·d stresses and, if there are values, n of z.
         """
         d, n, nodes = self.dim, self.n, range(self.dim + 1)
-        drifted = self._gradient_lines("drift_gather(s, c + a * W, t, q[a])")
+        drifted = ["const vec at = (vec){0} + t, part = (vec){0} + weight;"]
+        drifted += self._gradient_lines("drift_gather(s, c + a * W, at, q[a])")
         stresses = [f"stress[{i}] = s_[{i}];" for i in range(n * d)]
         against = [f"s_[{i}] -= reference[{i}];" for i in range(n * d)]
         if references > n * d:
@@ -204,9 +205,28 @@ class RegionSource:
             [
                 *drifted,
                 *self._force_lines(between, with_values=references > n * d),
-                *(f"kick(s, c + {a} * W, weight, f{a});" for a in nodes),
+                *(f"kick(s, c + {a} * W, part, f{a});" for a in nodes),
             ],
         )
+
+    def lone(self, corrected: bool) -> str:
+        """Source of ``lone_r``: W cells that share no node, each drifted to its own t: forces there.
+
+        Args:
+            corrected: Take the force at q + (h²/12) M⁻¹f(q), M the nodes' masses, ``soft`` = h²/12:
+                to leading order that of the softer potential V_K − (h²/24) ∇V_K·M⁻¹∇V_K.
+        """
+        first, *gradients = self._gradient_lines("drift_gather(s, c + a * W, t, q[a])")
+        forces, nodes = [*gradients, *self._force_lines([])], range(self.dim + 1)
+        soften = [f"soften(s, c + {a} * W, soft, f{a}, q[{a}]);" for a in nodes]
+        give = [f"memcpy(out[{a}], f{a}, sizeof f{a});" for a in nodes]
+        body = [first, *(["{", *forces, *soften, "}"] if corrected else []), *forces, *give]
+        return (
+            f"static void lone_{self.number}(const world *s, const int32_t *restrict c, "
+            "const vec *restrict b, const vec *restrict k, const vec t, const vec soft, "
+            "vec out[DIM + 1][NR]) {\n  (void)b, (void)k, (void)soft;\n  "
+            + "\n  ".join(body) + "\n}\n"
+        )  # fmt: skip
 
     def _force_lines(self, between: list[str], with_values: bool = False) -> list[str]:
         """Statements from gradients g, positions q to nodal forces f0 … fd.
