@@ -136,7 +136,7 @@ class AVI:
         if self.schedule == "exact":
             # A cell without stiffness of its own acts once per span.
             blocks = np.full(critical.shape, np.inf)
-            blocks[real] = np.minimum(steps, window)[disc.source_cell[real]]
+            blocks[real] = np.where(np.isfinite(steps), steps, window)[disc.source_cell[real]]
             return ExactRun(problem, self, window, blocks, own)
         problem.arrange(divisions(steps, window, self.schedule == "octaves"))
         return WindowRun(problem, self, window, own)

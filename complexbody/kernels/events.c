@@ -1,7 +1,9 @@
 /* SPDX-License-Identifier: LGPL-3.0-or-later
  * Replay of windows: events in order, boundaries of windows, references. Behind events.h and the
- * regions' event functions; needs EVENT(region, ...). */
+ * regions' event functions; needs EVENT(region, ...), without which
+ * there is no replay. */
 
+#ifdef EVENT
 static void act(const world *s, const group *g, double t, double weight, int mode) {
   if (g->last > g->first)
     EVENT(g->region, g->last - g->first, g->first, s->cell + g->first * (DIM + 1) * W,
@@ -22,6 +24,7 @@ void cb_replay(const world *s, const happening *list, int64_t first, int64_t las
 void cb_together(const world *s, int64_t first, int64_t last, double t, double part, int mode) {
   for (int64_t i = first; i < last; i++) act(s, s->groups + i, t, part * s->groups[i].step, mode);
 }
+#endif
 
 void cb_drift(const world *s, int64_t first, int64_t last, double t) {
   for (int64_t a = first; a < last; a += W) {

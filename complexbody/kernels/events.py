@@ -91,24 +91,26 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
     parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]
     if exact:
         parts.append(native.template("lone.h"))
-    cases, alone = "", ""
+    cases = ""
     for r, region in enumerate(regions(kernels)):
         forms = f"(s)->forms + {2 * r}"
-        if region is not None:
-            parts += [region.event(count), region.lone(method.corrected) if exact else ""]
+        if exact:
+            arguments = f"{forms}, s, c, cell, t, soft, count, out"
+            call = f"tabulated_lone({arguments})"
+            if region is not None:
+                parts.append(region.lone(bool(method.corrected)))
+                call = f"lone_{r}(s, c, b, k, t, soft, out)"
+        elif region is not None:
+            parts.append(region.event(count))
             call = f"event_{r}(blocks, c, g, k, held, kept, s, t, w, mode)"
-            lone = f"lone_{r}(s, c, b, k, t, soft, out)"
         else:
             arguments = f"{forms}, {forms} + 1, blocks, first, c, g, held, kept, s, t, w, mode"
             call = f"tabulated_event({arguments})"
-            lone = f"tabulated_lone({forms}, s, c, cell, t, soft, count, out)"
         cases += f"case {r}: {call}; break; "
-        alone += f"case {r}: {lone}; break; "
-    arguments = "region, blocks, first, c, g, k, held, kept, s, t, w, mode"
-    parts.append(f"#define EVENT({arguments}) switch (region) {{ {cases}}}")
-    arguments = "region, s, c, cell, b, k, t, soft, count, out"
-    parts.append(f"#define LONE({arguments}) switch (region) {{ {alone}}}")
-    parts.append(native.template("events.c"))
+    head = "EVENT(region, blocks, first, c, g, k, held, kept, s, t, w, mode)"
+    if exact:
+        head = "LONE(region, s, c, cell, b, k, t, soft, count, out)"
+    parts += [f"#define {head} switch (region) {{ {cases}}}", native.template("events.c")]
     library = native.load("\n".join([*parts, native.template("exact.c") if exact else ""]))
     library.cb_change_rates.restype = ctypes.c_double
     return library

@@ -177,8 +177,8 @@ def traction_nodes(points, cells):
     return out
 
 
-def reference(run, case):
-    """The same scene for the reference."""
+def reference(run, case, make=None):
+    """The same scene for the reference, windows by default; ``make`` is given what it is made of."""
     method, mesh = run.method, run.problem.scene.mesh
     points, cells = whole(mesh)
     x = np.pad(points, ((0, 0), (0, 3 - case.dim))).T
@@ -229,9 +229,14 @@ def reference(run, case):
     size = 0.4 if any(case.quartic) else 1.0
     given = [wave(m, s, size)(x).T for s, m in enumerate((n_u, k) * 2)]
     q, rates = np.hstack(given[:2]), np.hstack(given[2:])
-    out = Windows(
-        cells, potentials, divisions_of(run), run.step, masses, viscosities, q, rates, fixed,
-        targets, [], method.balanced, method.passes, method.filter, method.dissipation,
+    given = {
+        "cells": cells, "potentials": potentials, "window": run.step, "masses": masses,
+        "viscosities": viscosities, "q": q, "rates": rates, "fixed": fixed, "targets": targets,
+        "scheme": method.dissipation,
+    }  # fmt: skip
+    out = make(**given) if make else Windows(
+        divisions=divisions_of(run), balanced=method.balanced, passes=method.passes,
+        filter=method.filter, **given,
     )  # fmt: skip
     if case.loads:
         side, zero = traction_nodes(points, cells), np.zeros((len(points), n))
