@@ -43,7 +43,7 @@ class World(ctypes.Structure):
                 "record", "klass", "inverse_mass", "rate", "compliance", "eta", "basis",
                 "inverse_basis", "collected",
                 "groups", "cell", "geometry", "coefficient", "reference", "stress", "sums",
-                "counted", "coordinates", "forms",
+                "counted", "coordinates", "forms", "touched", "touched_from",
             )
         ),
         ("start", ctypes.c_double),
@@ -176,7 +176,8 @@ class AVIRun:
             "collected": self.collected, "cell": disc.cells, "geometry": disc.geometry,
             "coefficient": kernels.coefficients, "reference": self.reference,
             "stress": self.stress, "sums": self.sums, "counted": self._counted,
-            "coordinates": disc.position,
+            "coordinates": disc.position, "touched": self.plan.touched,
+            "touched_from": self.plan.touched_from,
         }  # fmt: skip
         for name, array in arrays.items():
             setattr(world, name, array.ctypes.data)
@@ -222,10 +223,11 @@ class AVIRun:
         disc = self.problem.disc
         self.collected = native.aligned((max(disc.shared, 1), disc.record))
         shape = (disc.blocks, max(self.references, 1), disc.lanes)
-        self.reference, self.stress = native.aligned(shape), native.aligned(shape)
-        self._old = native.aligned(shape)
+        self.reference = native.aligned(shape)
         rows = -(-max(self.references, 1) // disc.lanes) * disc.lanes
-        self._nodal = native.aligned((disc.nodes + 1, rows))
+        self.stress, self._old, self._nodal, self._smoothed = (
+            native.aligned((disc.nodes + 1, rows)) for _ in range(4)
+        )
         self._force = native.aligned((disc.nodes + 1, disc.record))
         self._rates = native.aligned((disc.nodes + 1, disc.record))
         width = max(rows, disc.record)
@@ -384,17 +386,18 @@ class AVIRun:
             )  # fmt: skip
             self.updates += disc.count
             np.copyto(self._old, self.stress)
-        blocks, nodal = ctypes.c_int64(disc.blocks), native.pointer(self._nodal)
-        old: Array | None = self._old
-        for _ in range(self.method.passes):
-            self._nodal[:] = 0.0
-            c.cb_to_nodes(self._world, blocks, native.pointer(old), nodal)
-            self._sum_shared(self._nodal)
-            c.cb_scale_nodes(self._world, nodal)
-            c.cb_to_cells(self._world, blocks, nodal)
-            old = None
+        blocks = ctypes.c_int64(disc.blocks)
+        now, then = self._nodal, self._smoothed
+        c.cb_carry(self._world, native.pointer(self._old), native.pointer(now))
+        for left in reversed(range(self.method.passes)):
+            self._sum_shared(now)
+            c.cb_scale_nodes(self._world, native.pointer(now))
+            if left:
+                then[:] = 0.0
+                c.cb_smooth(self._world, blocks, native.pointer(now), native.pointer(then))
+                now, then = then, now
         self._force[:] = 0.0
-        c.cb_reference_force(self._world, blocks, native.pointer(self._force))
+        c.cb_to_cells(self._world, blocks, native.pointer(now), native.pointer(self._force))
         self._add_loads(t + 0.5 * self.step)
         self._sum_shared(self._force)
         c.cb_accelerate(self._world, native.pointer(self._force))

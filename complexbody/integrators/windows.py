@@ -20,6 +20,7 @@ from mpi4py import MPI
 
 from complexbody.discretisation import Discretisation
 from complexbody.errors import StepError
+from complexbody.kernels.events import CHUNK
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -32,7 +33,7 @@ class Group(ctypes.Structure):
     """Mirror of ``group`` in events.c."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("first", "last", "region", "divisions")),
+        *((name, ctypes.c_int64) for name in ("first", "last", "region", "divisions", "chunk")),
         ("step", ctypes.c_double),
     )
 
@@ -111,6 +112,7 @@ class WindowPlan:
         groups: C array of groups, those touching shared nodes first.
         edge: Number of groups touching shared nodes.
         events: C array of interior events, 0 < t < W, by time; shared-node groups first.
+        touched, touched_from: Nodes that drift before each chunk of blocks acts.
         cuts: Exchanges (several ranks only), at the same times on every rank.
         updates: Cell updates per window (boundary counted once) on this rank.
     """
@@ -121,14 +123,32 @@ class WindowPlan:
         ends = sorted(cuts)
         runs = list(itertools.pairwise(ends))
         self.groups = (Group * max(len(runs), 1))()
-        self.edge, self.updates = 0, 0
+        self.edge, self.updates, chunk = 0, 0, 0
         for i, (first, last) in enumerate(runs):
             count = int(disc.group[first])
-            self.groups[i] = Group(first, last, int(disc.region[first]), count, window / count)
+            step = window / count
+            self.groups[i] = Group(first, last, int(disc.region[first]), count, chunk, step)
+            chunk += -(-(last - first) // CHUNK)
             self.edge += first < disc.boundary_blocks
             self.updates += count * int(np.sum(disc.source_cell[first:last] >= 0))
         self.count = len(runs)
+        self._chunks(disc, np.array(runs, np.int64).reshape(-1, 2), chunk)
         self._events(disc, window)
+
+    def _chunks(self, disc: Discretisation, runs: Ints, chunks: int) -> None:
+        """Nodes by the first chunk of CHUNK blocks, within each group, whose cells touch them."""
+        blocks = np.arange(disc.blocks)
+        group = np.searchsorted(runs[:, 1], blocks, side="right")
+        first = np.array([self.groups[i].chunk for i in range(self.count)], np.int64)
+        chunk = first[group] + (blocks - runs[group, 0]) // CHUNK
+        nodes = disc.cells.reshape(disc.blocks, -1)
+        key, at = np.unique(group[:, None] * (disc.nodes + 1) + nodes, return_index=True)
+        node, chunk = key % (disc.nodes + 1), chunk[at // max(nodes.shape[1], 1)]
+        real = node < disc.nodes
+        order = np.argsort(chunk[real], kind="stable")
+        self.touched = np.ascontiguousarray(node[real][order], dtype=np.int32)
+        counts = np.bincount(chunk[real], minlength=chunks)
+        self.touched_from = np.concatenate([[0], np.cumsum(counts)])
 
     def _events(self, disc: Discretisation, window: float) -> None:
         rows: list[tuple[float, int, int]] = []

@@ -5,8 +5,10 @@
  * taken there, and each node is kicked by h_K f. A node's record holds everything a drift needs:
  *   [ position (NR) | rate (NR) | acceleration (NR, only with a reference force) | time, 1/volume ]
  * time and 1/volume sit in the padding of position where there is room (TIME, INVERSE).
- * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, REFERENCES, BALANCED, DAMPED,
- * SCHEME, SLOW. Unless SLOW, inertia is diagonal and the components of nu share one rate. */
+ * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK, and of the
+ * reference: SLOTS, the place of each of the N DIM stresses (equal ones share it), STRESSES of them,
+ * REFERENCES with the self-actions behind. Unless SLOW, inertia is diagonal and the components of
+ * nu share one rate. */
 
 #define VN (NR < 8 ? NR : 8)
 typedef double nvec __attribute__((vector_size(8 * VN), aligned(8)));
@@ -16,12 +18,14 @@ typedef double nvec __attribute__((vector_size(8 * VN), aligned(8)));
 #define TIME N
 #define INVERSE (N + 1)
 #else
-#define RECORD (PARTS * NR + 2)
+#define RECORD ((PARTS + (NR < 2 ? 2 : 1)) * NR) /* whole vectors: none straddles a cache line */
 #define TIME (PARTS * NR)
 #define INVERSE (PARTS * NR + 1)
 #endif
 
-typedef struct { int64_t first, last, region, divisions; double step; } group; /* blocks, N_K, h_K */
+#define ROWS ((REFERENCES + W - 1) / W) /* vectors per node in [node][ROWS * W] */
+
+typedef struct { int64_t first, last, region, divisions, chunk; double step; } group; /* blocks, N_K, h_K */
 typedef struct { double time; int64_t group; } happening; /* a group acts, time within the window */
 
 typedef struct {
@@ -37,11 +41,14 @@ typedef struct {
   const group *groups;
   const int32_t *cell;
   const double *geometry, *coefficient;
-  double *reference, *stress; /* [block][REFERENCES][lane] */
+  double *reference;          /* [block][REFERENCES][lane] */
+  double *stress;             /* [node][ROWS * W]: sum of volume times stress of the node's cells */
   double *sums;               /* dissipated work */
   const uint8_t *counted;
   const double *coordinates;  /* [node][3], and for tabulated regions [region]{force, stress}: */
   const tabulated *forms;
+  const int32_t *touched;     /* the nodes of each chunk of CHUNK blocks no chunk of its group had */
+  const int64_t *touched_from; /* [chunk + 1] */
   double start;               /* of the window */
 } world;
 
@@ -233,9 +240,19 @@ INLINE void drift(const world *s, const int32_t *nodes, double t) {
 #endif
 }
 
-/* Drift the nodes of W cells to t and hand out their positions, one component per vector. */
-INLINE void drift_gather(const world *s, const int32_t *c, double t, vec out[NR]) {
-  drift(s, c, t);
+/* Drift distinct nodes to t. */
+INLINE void drift_all(const world *s, const int32_t *nodes, int64_t count, double t) {
+  int64_t i = 0;
+  for (; i + W <= count; i += W) drift(s, nodes + i, t);
+  if (i < count) {
+    int32_t rest[W];
+    for (int l = 0; l < W; l++) rest[l] = nodes[i + l < count ? i + l : count - 1];
+    drift(s, rest, t);
+  }
+}
+
+/* Positions of the nodes of W cells, one component per vector. */
+INLINE void gather_records(const world *s, const int32_t *c, vec out[NR]) {
 #if NR >= W
   for (int g = 0; g < NR; g += W) {
     vec r[W];
@@ -243,38 +260,63 @@ INLINE void drift_gather(const world *s, const int32_t *c, double t, vec out[NR]
     transpose(r);
     for (int i = 0; i < W; i++) out[g + i] = r[i];
   }
+#elif NR == 4
+  vec r[4];
+  for (int l = 0; l < 4; l++) {
+    const half a = *(const half *)record_of(s, c[l]), b = *(const half *)record_of(s, c[l + 4]);
+    r[l] = (vec){a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]};
+  }
+  transpose4(r);
+  for (int i = 0; i < 4; i++) out[i] = r[i];
 #else
   for (int l = 0; l < W; l++)
     for (int i = 0; i < N; i++) out[i][l] = record_of(s, c[l])[i];
 #endif
 }
 
+/* Drift the nodes of W cells to t and hand out their positions. */
+INLINE void drift_gather(const world *s, const int32_t *c, double t, vec out[NR]) {
+  drift(s, c, t);
+  gather_records(s, c, out);
+}
+
 /* Kick the nodes of W cells: rate += weight f / (volume m); shared nodes collect. */
 INLINE void kick(const world *s, const int32_t *c, double weight, const vec in[NR]) {
-#if NR >= W && !SLOW
+  int collect = 0;
+  for (int l = 0; l < W; l++) collect |= c[l] >= s->late && c[l] < s->beyond;
+  if (collect || SLOW || (NR < W && NR != 4)) {
+    for (int l = 0; l < W; l++) {
+      const int64_t a = c[l];
+      double *r = record_of(s, a), f[N];
+      for (int i = 0; i < N; i++) f[i] = in[i][l];
+      if (a >= s->late && a < s->beyond)
+        for (int i = 0; i < N; i++) s->collected[(a - s->late) * NR + i] += weight * f[i];
+      else
+        impulse(s, a, f, weight * r[INVERSE], r + NR);
+    }
+    return;
+  }
+#if !SLOW && NR >= W
   for (int g = 0; g < NR; g += W) {
     vec f[W];
     for (int i = 0; i < W; i++) f[i] = weight * in[g + i];
     transpose(f);
     for (int l = 0; l < W; l++) {
-      const int64_t a = c[l];
-      double *r = record_of(s, a);
-      const vec m = *(const vec_u *)(s->inverse_mass + (s->klass ? s->klass[a] : 0) * NR + g);
-      const int collect = a >= s->late && a < s->beyond;
-      vec_u *to = (vec_u *)(collect ? s->collected + (a - s->late) * NR + g : r + NR + g);
-      *to += collect ? f[l] : r[INVERSE] * m * f[l];
+      double *r = record_of(s, c[l]);
+      const double *m = s->inverse_mass + (s->klass ? s->klass[c[l]] : 0) * NR + g;
+      *(vec_u *)(r + NR + g) += r[INVERSE] * *(const vec_u *)m * f[l];
     }
   }
-#else
+#elif !SLOW && NR == 4
+  vec f[4];
+  for (int i = 0; i < 4; i++) f[i] = weight * in[i];
+  transpose4(f);
   for (int l = 0; l < W; l++) {
-    const int64_t a = c[l];
-    double *r = record_of(s, a), f[N];
-    const int collect = a >= s->late && a < s->beyond;
-    for (int i = 0; i < N; i++) f[i] = in[i][l];
-    if (collect)
-      for (int i = 0; i < N; i++) s->collected[(a - s->late) * NR + i] += weight * f[i];
-    else
-      impulse(s, a, f, weight * r[INVERSE], r + NR);
+    const vec p = f[l % 4];
+    const nvec q = l < 4 ? (nvec){p[0], p[1], p[2], p[3]} : (nvec){p[4], p[5], p[6], p[7]};
+    double *r = record_of(s, c[l]);
+    const double *m = s->inverse_mass + (s->klass ? s->klass[c[l]] : 0) * NR;
+    *(nvec *)(r + NR) += r[INVERSE] * *(const nvec *)m * q;
   }
 #endif
 }
@@ -282,19 +324,37 @@ INLINE void kick(const world *s, const int32_t *c, double weight, const vec in[N
 /* What a block does besides kicking: keep its stress, or act against the reference. */
 enum { KEEP = 1, AGAINST = 2 };
 
+/* Where the stress of a component along an axis stands among the references. */
+#if REFERENCES
+static const int slot[N * DIM] = SLOTS;
+
+/* Leave stresses (times r, the root of the volume) behind: node += r stress, once per window. */
+__attribute__((unused, noinline)) static void keep(const world *s, const int32_t *c, vec r,
+                                                   const vec *stress) {
+  for (int g = 0; g < ROWS; g++) {
+    vec row[W];
+    for (int i = 0; i < W; i++)
+      row[i] = g * W + i < REFERENCES ? r * stress[g * W + i] : (vec){0};
+    transpose(row);
+    for (int l = 0; l < W; l++)
+      for (int a = 0; a <= DIM; a++)
+        *(vec_u *)(s->stress + (int64_t)c[a * W + l] * ROWS * W + g * W) += row[l];
+  }
+}
+#endif
+
 /* An event of cells whose density is not quadratic: forces and mean stresses by FFCx. */
 __attribute__((unused)) static void tabulated_event(
     const tabulated *force, const tabulated *stress, int64_t blocks, int64_t first, const int32_t *c,
-    const double *geometry, const double *held, double *kept, const world *s, double t,
-    double weight, int mode) {
+    const double *geometry, const double *held, const world *s, double weight, int mode) {
   const int zero = 0; const uint8_t none = 0;
   double w[force->before + force->after + stress->before + stress->after + LOCAL + 1];
   double at[3 * (DIM + 1)], out[LOCAL], mean[REFERENCES + 1];
   for (int64_t m = 0; m < blocks; m++, c += (DIM + 1) * W) {
     const vec *b = (const vec *)(geometry + m * GEOMETRY * W);
-    vec f[DIM + 1][NR];
+    vec f[DIM + 1][NR], left[ROWS * W + 1];
     memset(f, 0, sizeof f);
-    for (int a = 0; a <= DIM; a++) drift(s, c + a * W, t);
+    memset(left, 0, sizeof left);
     for (int l = 0; l < W && c[l] < s->nodes; l++) {
       if (force->function) {
         tabulated_input(force, first + m, l, c, s->record, RECORD, s->coordinates, w, at);
@@ -308,22 +368,25 @@ __attribute__((unused)) static void tabulated_event(
         memset(mean, 0, sizeof mean);
         stress->function(mean, w, stress->constants, at, &zero, &none, 0);
         for (int i = 0; i < REFERENCES; i++) /* the mean times sqrt|K| */
-          kept[(m * REFERENCES + i) * W + l] = mean[i] / b[DIM * DIM][l];
+          left[i][l] = mean[i] / b[DIM * DIM][l];
       }
     }
+#if REFERENCES
+    if (mode & KEEP) keep(s, c, b[DIM * DIM], left);
     if (mode & AGAINST) {
       const vec *r = (const vec *)(held + m * REFERENCES * W);
-      for (int i = 0; i < N && REFERENCES; i++) {
-        const vec z = REFERENCES > N * DIM ? r[N * DIM + i] * b[DIM * DIM] / (DIM + 1.0) : (vec){0};
+      for (int i = 0; i < N; i++) {
+        const vec z = REFERENCES > STRESSES ? r[STRESSES + i] * b[DIM * DIM] / (DIM + 1.0) : (vec){0};
         for (int a = 1; a <= DIM; a++) {
           vec y = {0};
-          for (int j = 0; j < DIM; j++) y += r[i * DIM + j] * b[(a - 1) * DIM + j];
+          for (int j = 0; j < DIM; j++) y += r[slot[i * DIM + j]] * b[(a - 1) * DIM + j];
           f[a][i] += y + z;
           f[0][i] -= y;
         }
         f[0][i] += z;
       }
     }
+#endif
     for (int a = 0; a <= DIM; a++) kick(s, c + a * W, weight, f[a]);
   }
 }

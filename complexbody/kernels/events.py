@@ -11,6 +11,9 @@ from complexbody.kernels.library import Kernels
 from complexbody.kernels.quadratic import RegionSource
 from complexbody.masses import SCHEMES
 
+#: Blocks of cells whose nodes drift together before the cells act: less than an L1 cache full.
+CHUNK = 16
+
 
 def regions(kernels: Kernels) -> list[RegionSource | None]:
     """Source generators of the regions with generated code; None for the others."""
@@ -28,11 +31,24 @@ def regions(kernels: Kernels) -> list[RegionSource | None]:
     return out
 
 
+def has_values(kernels: Kernels) -> bool:
+    """True if a region may have self-actions, and the reference thus holds n of them."""
+    return any(region is None or region.has_values for region in regions(kernels))
+
+
+def slots(kernels: Kernels) -> list[int]:
+    """Place of each of the n·d stresses in the reference: stresses equal in all regions share it."""
+    disc, found = kernels.disc, regions(kernels)
+    if any(region is None for region in found):
+        return list(range(disc.n * disc.dim))
+    rows = list(zip(*(region.stress_rows() for region in found if region), strict=True))
+    distinct = list(dict.fromkeys(rows))
+    return [distinct.index(row) for row in rows]
+
+
 def references(kernels: Kernels) -> int:
-    """Reference values per cell: n·d stresses, and n self-actions if a region may have them."""
-    disc = kernels.disc
-    values = any(region is None or region.has_values for region in regions(kernels))
-    return disc.n * disc.dim + (disc.n if values else 0)
+    """Reference values per cell: distinct stresses, and n self-actions if a region may have them."""
+    return max(slots(kernels)) + 1 + (kernels.disc.n if has_values(kernels) else 0)
 
 
 class Forms:
@@ -42,7 +58,7 @@ class Forms:
         disc, action = kernels.disc, kernels.action
         self.records = (TabulatedRecord * (2 * len(action.scene.bodies)))()
         self._keep = []
-        values = references(kernels) > disc.n * disc.dim
+        values = has_values(kernels)
         for r, body in enumerate(action.scene.bodies):
             if kernels.densities.generated[r]:
                 continue
@@ -60,7 +76,7 @@ def record_size(components: int, record: int, balanced: bool) -> tuple[int, int,
     parts = 3 if balanced else 2
     if record - components >= 2:
         return parts * record, components, components + 1
-    return parts * record + 2, parts * record, parts * record + 1
+    return (parts + (2 if record < 2 else 1)) * record, parts * record, parts * record + 1
 
 
 def load(kernels: Kernels, balanced: bool, damped: bool, slow: bool, scheme: str) -> ctypes.CDLL:
@@ -74,26 +90,28 @@ def load(kernels: Kernels, balanced: bool, damped: bool, slow: bool, scheme: str
         scheme: Dissipation scheme.
     """
     disc, scene = kernels.disc, kernels.action.scene
-    count = references(kernels) if balanced else 0
+    place = slots(kernels) if balanced else []
+    count, values = (references(kernels) if balanced else 0), has_values(kernels)
     defines = {
         "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
         "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1,
         "COEFFICIENTS": len(kernels.densities.coefficients), "REFERENCES": count,
         "BALANCED": int(balanced), "DAMPED": int(damped), "SCHEME": SCHEMES.index(scheme),
-        "SLOW": int(slow),
+        "SLOW": int(slow), "CHUNK": CHUNK, "STRESSES": max(place, default=-1) + 1,
+        "SLOTS": "{" + ", ".join(map(str, place)) + "}",
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
     parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]
     cases = ""
     for r, region in enumerate(regions(kernels)):
         if region is not None:
-            parts.append(region.event(count))
-            call = f"event_{r}(blocks, c, g, k, held, kept, s, t, w, mode)"
+            parts.append(region.event(place, values))
+            call = f"event_{r}(blocks, c, g, k, held, s, w, mode)"
         else:
             forms = f"(s)->forms + {2 * r}, (s)->forms + {2 * r + 1}"
-            call = f"tabulated_event({forms}, blocks, first, c, g, held, kept, s, t, w, mode)"
+            call = f"tabulated_event({forms}, blocks, first, c, g, held, s, w, mode)"
         cases += f"case {r}: {call}; break; "
-    arguments = "region, blocks, first, c, g, k, held, kept, s, t, w, mode"
+    arguments = "region, blocks, first, c, g, k, held, s, w, mode"
     parts.append(f"#define EVENT({arguments}) switch (region) {{ {cases}}}")
     library = native.load("\n".join([*parts, native.template("events.c")]))
     library.cb_change_rates.restype = ctypes.c_double

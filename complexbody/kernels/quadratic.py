@@ -177,33 +177,45 @@ class RegionSource:
             ],
         )
 
-    def event(self, references: int) -> str:
-        """Source of ``event_r``: drift to t, force there (against the reference), kick.
+    def stress_rows(self) -> list[tuple[Any, ...]]:
+        """What each of the n·d stresses is made of: equal rows are equal stresses."""
+        own = self.gradients + self.values
+        return [
+            tuple((j, _text(self.total[i, j])) for j in own if (i, j) in self.total)
+            for i in self.gradients
+        ]
+
+    def event(self, slots: Sequence[int], values: bool) -> str:
+        """Source of ``event_r``: force at the drifted positions (against the reference), kick.
 
         Args:
-            references: Reference values per cell: n·d stresses and, if there are values, n of z.
+            slots: Place of each of the n·d stresses among the references; none without a reference.
+            values: n mean self-actions z stand behind them.
         """
         d, n, nodes = self.dim, self.n, range(self.dim + 1)
-        drifted = self._gradient_lines("drift_gather(s, c + a * W, t, q[a])")
-        stresses = [f"stress[{i}] = s_[{i}];" for i in range(n * d)]
-        against = [f"s_[{i}] -= reference[{i}];" for i in range(n * d)]
-        if references > n * d:
-            stresses += [f"stress[{n * d + i}] = z[{i}];" for i in range(n)]
-            against += [f"p[{i}] -= reference[{n * d + i}] * r / {d + 1}.0;" for i in range(n)]
-        between = [
-            f"vec *stress = (vec *)(kept + m * {references} * W); (void)stress;",
-            f"const vec *reference = (const vec *)(held + m * {references} * W); (void)reference;",
-            f"if (mode & KEEP) {{ {' '.join(stresses)} }}" if references else "",
-            f"if (mode & AGAINST) {{ {' '.join(against)} }}" if references else "",
-        ]
+        lines = self._gradient_lines("gather_records(s, c + a * W, q[a])")
+        between: list[str] = []
+        if slots:
+            kept = {slot: f"left[{slot}] = s_[{i}];" for i, slot in enumerate(slots)}
+            against = [f"s_[{i}] -= reference[{slot}];" for i, slot in enumerate(slots)]
+            if values:
+                first = len(kept)
+                kept |= {first + i: f"left[{first + i}] = z[{i}];" for i in range(n)}
+                at = [f"reference[{first + i}] * b[{d * d}] / {d + 1}.0" for i in range(n)]
+                against += [f"p[{i}] -= {at[i]};" for i in range(n)]
+            between = [
+                "const vec *reference = (const vec *)(held + m * REFERENCES * W);",
+                f"if (mode & KEEP) {{ vec left[REFERENCES]; {' '.join(kept.values())}",
+                f"  keep(s, c, b[{d * d}], left); }}",
+                f"if (mode & AGAINST) {{ {' '.join(against)} }}",
+            ]
         return self._loop(
             f"static void event_{self.number}(int64_t blocks, const int32_t *restrict c, "
             "const double *restrict geometry, const double *restrict coefficient, "
-            "const double *restrict held, double *restrict kept, const world *s, double t, "
-            "double weight, int mode)",
+            "const double *restrict held, const world *s, double weight, int mode)",
             [
-                *drifted,
-                *self._force_lines(between, with_values=references > n * d),
+                *lines,
+                *self._force_lines(between, with_values=values and bool(slots)),
                 *(f"kick(s, c + {a} * W, weight, f{a});" for a in nodes),
             ],
         )
