@@ -12,7 +12,7 @@ from complexbody.kernels.quadratic import RegionSource
 from complexbody.masses import SCHEMES
 
 #: Blocks of cells whose nodes drift together before the cells act: less than an L1 cache full.
-CHUNK = 16
+CHUNK = 8
 
 
 def regions(kernels: Kernels) -> list[RegionSource | None]:
@@ -37,7 +37,7 @@ def has_values(kernels: Kernels) -> bool:
 
 
 def slots(kernels: Kernels) -> list[int]:
-    """Place of each of the n·d stresses in the reference: stresses equal in all regions share it."""
+    """Place of each of the n·d stresses in the reference: those equal in all regions share it."""
     disc, found = kernels.disc, regions(kernels)
     if any(region is None for region in found):
         return list(range(disc.n * disc.dim))
@@ -47,7 +47,7 @@ def slots(kernels: Kernels) -> list[int]:
 
 
 def references(kernels: Kernels) -> int:
-    """Reference values per cell: distinct stresses, and n self-actions if a region may have them."""
+    """Reference values per cell: distinct stresses, and n self-actions if a region may have any."""
     return max(slots(kernels)) + 1 + (kernels.disc.n if has_values(kernels) else 0)
 
 
