@@ -236,7 +236,7 @@ def measure(dim: int, cells: int, grade: float, viscosity: float, repeats: int) 
             row.take()
     sets, unit = run.time_sets, sync.best / sync.updates
     print(
-        f"\n{dim}D, {count} cells, {2 * dim} components, steps up to 1 : {sets.asynchronicity:.0f}, "
+        f"\n{dim}D, {count} cells, {2 * dim} components, steps 1 to {sets.asynchronicity:.0f}, "
         f"ideal speed-up {sets.ideal:.2f}, triad {24e-9 * sweep.updates / sweep.best:.1f} GB/s"
     )
     print(

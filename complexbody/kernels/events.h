@@ -280,11 +280,21 @@ INLINE void drift_gather(const world *s, const int32_t *c, double t, vec out[NR]
   gather_records(s, c, out);
 }
 
+/* A factor known to be 1 costs nothing. */
+#define SCALED(weight, f) (__builtin_constant_p(weight) && (weight) == 1.0 ? (f) : (weight) * (f))
+
+/* True if some of W nodes are shared and collect. */
+INLINE int collects(const world *s, const int32_t *c) {
+  if (s->late == s->beyond) return 0;
+  const uint32_t late = (uint32_t)s->late, shared = (uint32_t)(s->beyond - s->late);
+  int any = 0;
+  for (int l = 0; l < W; l++) any |= (uint32_t)c[l] - late < shared;
+  return any;
+}
+
 /* Kick the nodes of W cells: rate += weight f / (volume m); shared nodes collect. */
 INLINE void kick(const world *s, const int32_t *c, double weight, const vec in[NR]) {
-  int collect = 0;
-  for (int l = 0; l < W; l++) collect |= c[l] >= s->late && c[l] < s->beyond;
-  if (collect || SLOW || (NR < W && NR != 4)) {
+  if (collects(s, c) || SLOW || (NR < W && NR != 4)) {
     for (int l = 0; l < W; l++) {
       const int64_t a = c[l];
       double *r = record_of(s, a), f[N];
@@ -299,7 +309,7 @@ INLINE void kick(const world *s, const int32_t *c, double weight, const vec in[N
 #if !SLOW && NR >= W
   for (int g = 0; g < NR; g += W) {
     vec f[W];
-    for (int i = 0; i < W; i++) f[i] = weight * in[g + i];
+    for (int i = 0; i < W; i++) f[i] = SCALED(weight, in[g + i]);
     transpose(f);
     for (int l = 0; l < W; l++) {
       double *r = record_of(s, c[l]);
@@ -309,7 +319,7 @@ INLINE void kick(const world *s, const int32_t *c, double weight, const vec in[N
   }
 #elif !SLOW && NR == 4
   vec f[4];
-  for (int i = 0; i < 4; i++) f[i] = weight * in[i];
+  for (int i = 0; i < 4; i++) f[i] = SCALED(weight, in[i]);
   transpose4(f);
   for (int l = 0; l < W; l++) {
     const vec p = f[l % 4];

@@ -209,23 +209,29 @@ class RegionSource:
                 f"  keep(s, c, b[{d * d}], left); }}",
                 f"if (mode & AGAINST) {{ {' '.join(against)} }}",
             ]
+        # There are fewer stresses than forces: they take the weight.
+        between += [f"s_[{i}] *= weight;" for i in range(n * d)]
+        between += [f"p[{i}] *= weight;" for i in range(n)]
         return self._loop(
             f"static void event_{self.number}(int64_t blocks, const int32_t *restrict c, "
             "const double *restrict geometry, const double *restrict coefficient, "
             "const double *restrict held, const world *s, double weight, int mode)",
             [
                 *lines,
-                *self._force_lines(between, with_values=values and bool(slots)),
-                *(f"kick(s, c + {a} * W, weight, f{a});" for a in nodes),
+                *self._force_lines(between, with_values=values and bool(slots), weight="weight * "),
+                *(f"kick(s, c + {a} * W, 1.0, f{a});" for a in nodes),
             ],
         )
 
-    def _force_lines(self, between: list[str], with_values: bool = False) -> list[str]:
+    def _force_lines(
+        self, between: list[str], with_values: bool = False, weight: str = ""
+    ) -> list[str]:
         """Statements from gradients g, positions q to nodal forces f0 … fd.
 
         Args:
             between: Statements between stresses (s_, and the mean self-action z) and forces.
             with_values: Provide z = √|K| (H_vG G + H_vv mean), for ``between``.
+            weight: A factor of forces that come of values alone, in C.
         """
         d, n = self.dim, self.n
         grads, vals = self.gradients, self.values
@@ -263,7 +269,7 @@ class RegionSource:
                 body.append(f"f{a}[{i}] = -y{a}_{i}{f' - p[{i}]' if own else ''};")
         if vv:
             factor = f"{d + 1}.0" if self.lumped else f"{(d + 1) * (d + 2)}.0"
-            body.append(f"const vec w = r * r / {factor};")
+            body.append(f"const vec w = {weight}r * r / {factor};")
             present = sorted({row - 3 * n for row, _ in vv})
             for a in range(d + 1):
                 at = [f"q[{a}][{i}]" if self.lumped else f"(q[{a}][{i}] + t{i})" for i in range(n)]
