@@ -63,6 +63,7 @@ INLINE void kick(const world *s, const int32_t *c, double weight, const vec *f) 
   double *r = s->record + *c * RECORD;
   for (int i = 0; i < N; i++) r[N + i] += weight * r[2 * N + 1] * s->inverse_mass[i] * f[i];
 }
+#define ahead(p, size)
 %s
 static void sift(entry *heap, int64_t size, int64_t at) {
   const entry moved = heap[at];

@@ -6,7 +6,7 @@
  *   [ position (NR) | rate (NR) | acceleration (NR, only with a reference force) | time, 1/volume ]
  * time and 1/volume sit in the padding of position where there is room (TIME, INVERSE).
  * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK, and of the
- * reference: SLOTS, the place of each of the N DIM stresses (equal ones share it), STRESSES of them,
+ * reference: PLACES, the place of each of the N DIM stresses (equal ones share it), STRESSES of them,
  * REFERENCES with the self-actions behind. Unless SLOW, inertia is diagonal and the components of
  * nu share one rate. */
 
@@ -280,6 +280,11 @@ INLINE void drift_gather(const world *s, const int32_t *c, double t, vec out[NR]
   gather_records(s, c, out);
 }
 
+/* Ask for what a later block will read: groups are runs too short for the processor to foresee. */
+INLINE void ahead(const vec *p, int size) {
+  for (int i = 0; i < size; i++) __builtin_prefetch(p + 8 * size + i, 0, 2);
+}
+
 /* A factor known to be 1 costs nothing. */
 #define SCALED(weight, f) (__builtin_constant_p(weight) && (weight) == 1.0 ? (f) : (weight) * (f))
 
@@ -336,7 +341,7 @@ enum { KEEP = 1, AGAINST = 2 };
 
 /* Where the stress of a component along an axis stands among the references. */
 #if REFERENCES
-static const int slot[N * DIM] = SLOTS;
+static const int slot[N * DIM] = PLACES;
 
 /* Leave stresses (times r, the root of the volume) behind: node += r stress, once per window. */
 __attribute__((unused, noinline)) static void keep(const world *s, const int32_t *c, vec r,

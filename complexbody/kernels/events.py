@@ -98,7 +98,7 @@ def load(kernels: Kernels, balanced: bool, damped: bool, slow: bool, scheme: str
         "COEFFICIENTS": len(kernels.densities.coefficients), "REFERENCES": count,
         "BALANCED": int(balanced), "DAMPED": int(damped), "SCHEME": SCHEMES.index(scheme),
         "SLOW": int(slow), "CHUNK": CHUNK, "STRESSES": max(place, default=-1) + 1,
-        "SLOTS": "{" + ", ".join(map(str, place)) + "}",
+        "PLACES": "{" + ", ".join(map(str, place)) + "}",
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
     parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]

@@ -194,7 +194,7 @@ class RegionSource:
         """
         d, n, nodes = self.dim, self.n, range(self.dim + 1)
         lines = self._gradient_lines("gather_records(s, c + a * W, q[a])")
-        between: list[str] = []
+        between = ["ahead(b, GEOMETRY);"]
         if slots:
             kept = {slot: f"left[{slot}] = s_[{i}];" for i, slot in enumerate(slots)}
             against = [f"s_[{i}] -= reference[{slot}];" for i, slot in enumerate(slots)]
@@ -203,8 +203,9 @@ class RegionSource:
                 kept |= {first + i: f"left[{first + i}] = z[{i}];" for i in range(n)}
                 at = [f"reference[{first + i}] * b[{d * d}] / {d + 1}.0" for i in range(n)]
                 against += [f"p[{i}] -= {at[i]};" for i in range(n)]
-            between = [
+            between += [
                 "const vec *reference = (const vec *)(held + m * REFERENCES * W);",
+                "ahead(reference, REFERENCES);",
                 f"if (mode & KEEP) {{ vec left[REFERENCES]; {' '.join(kept.values())}",
                 f"  keep(s, c, b[{d * d}], left); }}",
                 f"if (mode & AGAINST) {{ {' '.join(against)} }}",
