@@ -35,9 +35,10 @@ from complexbody.timesets import cell_steps
 METHODS: dict[str, Any] = {
     "plain windows": AVI(balanced=False),
     "balanced windows": AVI(),
+    "exact": AVI(schedule="exact", balanced=False),
 }
-#: Parts of a window whose share is told, by method of a run.
-PARTS = {"_set_reference": "reference", "_filter": "filter"}
+#: Parts of a balanced window whose share is told.
+PARTS = {"set": "reference", "filter": "filter"}
 UNTIL = 50.0  # long beside any window
 
 TRIAD = """
@@ -163,16 +164,19 @@ def watch(run: Any) -> dict[str, float]:
     """Processor time of the run's PARTS from now on, by name."""
     shares: dict[str, float] = {}
 
-    def booked(name: str, call: Callable[..., Any]) -> Callable[..., None]:
-        def timed(*args: Any) -> None:
-            shares[name] += spent(lambda: call(*args))
+    def booked(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any) -> Any:
+            begun = time.process_time()
+            out = call(*args)
+            shares[name] += time.process_time() - begun
+            return out
 
         return timed
 
-    for attribute, name in PARTS.items():
-        if hasattr(run, attribute):
-            shares[name] = 0.0
-            setattr(run, attribute, booked(name, getattr(run, attribute)))
+    balance = getattr(run, "balance", None)
+    for attribute, name in PARTS.items() if balance else ():
+        shares[name] = 0.0
+        setattr(balance, attribute, booked(name, getattr(balance, attribute)))
     return shares
 
 
@@ -207,7 +211,8 @@ def asynchronous(method: Any, problem: Callable[[], Problem]) -> tuple[Row, Any]
     run.advance(1)
     updates = run.updates - before
     windows = max(1, round(3e6 / updates))
-    own = [*vars(run).values(), *vars(run.plan).values()]
+    parts = [run, *(getattr(run, name, None) for name in ("plan", "balance", "schedule"))]
+    own = [value for part in parts if part is not None for value in vars(part).values()]
     arrays = {id(a): a.nbytes for a in own if isinstance(a, np.ndarray)}
     size = run.problem.kernels.bytes_per_cell() + sum(arrays.values()) / run.problem.disc.count
     return Row(
@@ -223,9 +228,10 @@ def measure(dim: int, cells: int, grade: float, viscosity: float, repeats: int) 
     count, size = one.problem.disc.count, one.problem.kernels.bytes_per_cell()
     steps = max(1, round(3e6 / count))
     sync = Row(lambda: one.advance(steps), steps * count, count / one.step, size)
-    rows = {"synchronous": sync}
+    rows, sets = {"synchronous": sync}, None
     for name, method in METHODS.items():
         rows[name], run = asynchronous(method, problem)
+        sets = getattr(run, "time_sets", sets)  # windows have them
     if viscosity == 0:
         heap = Heap(one.problem, AVI().safety)
         rows["heap"] = Row(lambda: heap.events(10**6), 10**6, heap.rate, heap.bytes() / count)
@@ -235,7 +241,8 @@ def measure(dim: int, cells: int, grade: float, viscosity: float, repeats: int) 
     for _ in range(repeats):
         for row in (*rows.values(), sweep):
             row.take()
-    sets, unit = run.time_sets, sync.best / sync.updates
+    assert sets is not None
+    unit = sync.best / sync.updates
     print(
         f"\n{dim}D, {count} cells, {2 * dim} components, steps 1 to {sets.asynchronicity:.0f}, "
         f"ideal speed-up {sets.ideal:.2f}, triad {24e-9 * sweep.updates / sweep.best:.1f} GB/s"

@@ -70,6 +70,7 @@ class Halo:
 
     Attributes:
         sends: Positions of shared nodes in the order in which they are packed.
+        starts: A neighbour's nodes are ``sends[starts[i]:starts[i+1]]``.
         start, source: For shared node i, ``source[start[i]:start[i+1]]`` are rows of the receive
             buffer in the order of the ranks, −1 standing for this rank's own part.
         owner: True where this rank is the lowest that touches the node (it counts it in sums).
@@ -87,7 +88,7 @@ class Halo:
                     lists.setdefault(rank, []).append(position)
         self.neighbours = sorted(lists)
         sizes = [len(lists[r]) for r in self.neighbours]
-        offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+        self.starts = offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         self.sends = np.array([p for r in self.neighbours for p in lists[r]], dtype=np.int32)
         self.outgoing = np.zeros((int(offsets[-1]), width))
         self.incoming = np.zeros((int(offsets[-1]), width))

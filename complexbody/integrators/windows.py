@@ -98,13 +98,15 @@ class TimeSets:
 class Cut:
     """A time at which ranks exchange kicks: after the shared-node events [first, shared).
 
-    The events [shared, last) at the same time touch no shared node.
+    The events [shared, last) at the same time touch no shared node. ``touched`` are the shared
+    nodes, by position, on which cells of any rank act then.
     """
 
     first: int
     shared: int
     last: int
     time: float
+    touched: npt.NDArray[np.int32]
 
 
 class WindowPlan:
@@ -120,6 +122,7 @@ class WindowPlan:
         events: C array of interior events, 0 < t < W, by time; shared-node groups first.
         touched, touched_from: Nodes that drift before each chunk of blocks acts.
         cuts: Exchanges (several ranks only), at the same times on every rank.
+        every_shared: All shared nodes by position.
         updates: Cell updates per window (boundary counted once) on this rank.
     """
 
@@ -168,19 +171,34 @@ class WindowPlan:
             self.events[at] = Happening(fraction * window, group)
         self.total = len(rows)
         self.cuts: list[Cut] = []
+        self.every_shared = np.arange(disc.shared, dtype=np.int32)
         if disc.comm.size == 1:
             return
         mine = {self.groups[i].divisions for i in range(self.edge)}
-        every = set().union(*disc.comm.allgather(mine))
-        times = sorted({j / n for n in every for j in range(1, n)})
+        every = sorted(set().union(*disc.comm.allgather(mine)))
+        acting: dict[float, list[int]] = {}
+        for i, n in enumerate(every):
+            for j in range(1, n):
+                acting.setdefault(j / n, []).append(i)
+        touched = _touched(disc, every)
         fractions = np.array([row[0] for row in rows])
         interior = np.array([row[1] for row in rows], dtype=bool)
         before = 0
-        for time in times:
+        for time in sorted(acting):
             first, last = np.searchsorted(fractions, [time, np.nextafter(time, 2)])
             shared = int(first + np.sum(~interior[first:last]))
-            self.cuts.append(Cut(int(before), shared, int(last), time * window))
+            which = np.flatnonzero(touched[:, acting[time]].any(axis=1)).astype(np.int32)
+            self.cuts.append(Cut(int(before), shared, int(last), time * window, which))
             before = int(last)
+
+
+def _touched(disc: Discretisation, divisions: list[int]) -> npt.NDArray[np.bool_]:
+    """Shared nodes that cells of N_K equal to each of ``divisions`` touch on any rank; collective."""
+    flags = np.zeros((disc.nodes + 1, len(divisions)))
+    for block in range(disc.boundary_blocks):
+        flags[disc.cells[block].ravel(), divisions.index(int(disc.group[block]))] = 1.0
+    disc.sum_shared(flags[:-1])
+    return flags[disc.late : disc.late + disc.shared] > 0
 
 
 def window_length(steps: Array, until: float, comm: Any) -> float:

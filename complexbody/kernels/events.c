@@ -1,7 +1,8 @@
 /* SPDX-License-Identifier: LGPL-3.0-or-later
  * Replay of windows: events in order, boundaries of windows, references. Behind events.h and the
- * regions' event functions; needs EVENT(region, ...). */
+ * regions' event functions; needs EVENT(region, ...), without which there is no replay. */
 
+#ifdef EVENT
 /* Chunk by chunk, nodes drift and cells kick: what drifts together is still in cache when kicked. */
 static void act(const world *s, const group *g, double t, double weight, int mode) {
   const int64_t *from = s->touched_from + g->chunk;
@@ -26,25 +27,25 @@ void cb_together(const world *s, int64_t first, int64_t last, double t, double p
   if (mode & KEEP) memset(s->stress, 0, (s->nodes + 1) * ROWS * W * sizeof(double));
   for (int64_t i = first; i < last; i++) act(s, s->groups + i, t, part * s->groups[i].step, mode);
 }
+#endif
 
 void cb_drift(const world *s, int64_t first, int64_t last, double t) {
   for (int64_t a = first; a < last; a += W) {
     int32_t some[W];
     for (int l = 0; l < W; l++) some[l] = (int32_t)(a + l < last ? a + l : last - 1);
-    drift(s, some, t);
+    drift(s, some, (vec){0} + t);
   }
 }
 
-/* Kicks of shared nodes, collected and summed over ranks, at time t; empties the collection. */
-void cb_apply(const world *s, double t) {
-  for (int64_t a = s->late; a < s->beyond; a++) {
-    double *sum = s->collected + (a - s->late) * NR, *r = record_of(s, a);
-    int any = 0;
-    for (int i = 0; i < N; i++) any |= sum[i] != 0;
-    if (!any) continue;
+/* Kicks of shared nodes, collected and summed over ranks, at time t, for the `count` nodes whose cells
+ * acted on some rank: they drift even if no force comes of it. Empties the collection. */
+void cb_apply(const world *s, double t, const int32_t *rows, int64_t count) {
+  for (int64_t j = 0; j < count; j++) {
+    const int64_t a = s->late + rows[j];
+    double *sum = s->collected + (int64_t)rows[j] * NR, *r = record_of(s, a);
     int32_t some[W];
     for (int l = 0; l < W; l++) some[l] = (int32_t)a;
-    drift(s, some, t);
+    drift(s, some, (vec){0} + t);
     impulse(s, a, sum, r[INVERSE], r + NR);
     memset(sum, 0, NR * sizeof(double));
   }

@@ -4,30 +4,32 @@
 from __future__ import annotations
 
 import ctypes
+from typing import TYPE_CHECKING
 
 from complexbody import native
+from complexbody.kernels.event_source import EventSource
 from complexbody.kernels.ffcx import Tabulated, TabulatedRecord
 from complexbody.kernels.library import Kernels
-from complexbody.kernels.quadratic import RegionSource
 from complexbody.masses import SCHEMES
+
+if TYPE_CHECKING:
+    from complexbody.integrators.asynchronous import AVI
 
 #: Blocks of cells whose nodes drift together before the cells act: less than an L1 cache full.
 CHUNK = 8
 
 
-def regions(kernels: Kernels) -> list[RegionSource | None]:
+def regions(kernels: Kernels) -> list[EventSource | None]:
     """Source generators of the regions with generated code; None for the others."""
     d, disc, scene = kernels.densities, kernels.disc, kernels.action.scene
     lumped = scene.self_action == "lumped"
-    out: list[RegionSource | None] = []
+    out: list[EventSource | None] = []
     for r, generated in enumerate(d.generated):
         stored = d.stored[r]
         if not generated or stored is None:
             out.append(None)
             continue
-        out.append(
-            RegionSource(r, stored, d.potential[r], disc.n, disc.dim, lumped, d.coefficients)
-        )
+        out.append(EventSource(r, stored, d.potential[r], disc.n, disc.dim, lumped, d.coefficients))
     return out
 
 
@@ -79,40 +81,61 @@ def record_size(components: int, record: int, balanced: bool) -> tuple[int, int,
     return (parts + (2 if record < 2 else 1)) * record, parts * record, parts * record + 1
 
 
-def load(kernels: Kernels, balanced: bool, damped: bool, slow: bool, scheme: str) -> ctypes.CDLL:
+def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL:
     """Compile the events of a scene.
 
     Args:
         kernels: The scene's kernels.
-        balanced: Nodes carry a constant acceleration, cells a reference.
+        method: The integrator: balanced or not, its dissipation scheme.
         damped: There is viscosity.
         slow: Components of ν differ in η/ρ̄, lack inertia, or are coupled by Ω or η.
-        scheme: Dissipation scheme.
     """
     disc, scene = kernels.disc, kernels.action.scene
-    place = slots(kernels) if balanced else []
-    count, values = (references(kernels) if balanced else 0), has_values(kernels)
+    place = slots(kernels) if method.balanced else []
+    count, values = (references(kernels) if method.balanced else 0), has_values(kernels)
+    exact = method.schedule == "exact"
+    coefficients = len(kernels.densities.coefficients)
     defines = {
         "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
-        "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1,
-        "COEFFICIENTS": len(kernels.densities.coefficients), "REFERENCES": count,
-        "BALANCED": int(balanced), "DAMPED": int(damped), "SCHEME": SCHEMES.index(scheme),
-        "SLOW": int(slow), "CHUNK": CHUNK, "STRESSES": max(place, default=-1) + 1,
+        "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1, "COEFFICIENTS": coefficients,
+        "REFERENCES": count, "BALANCED": int(method.balanced), "DAMPED": int(damped),
+        "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
+        "CORRECTED": int(method.corrected), "PACKED": packed_size(kernels),
+        "CHUNK": CHUNK, "STRESSES": max(place, default=-1) + 1,
         "PLACES": "{" + ", ".join(map(str, place)) + "}",
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
-    parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]
+    files = ("vectors.h", "tabulated.h", "drifts.h", "events.h")
+    parts += [native.template(name) for name in files]
+    if exact:
+        parts.append(native.template("lone.h"))
     cases = ""
     for r, region in enumerate(regions(kernels)):
-        if region is not None:
+        forms = f"(s)->forms + {2 * r}"
+        if exact:
+            arguments = f"{forms}, s, c, cell, t, soft, count, out"
+            call = f"tabulated_lone({arguments})"
+            if region is not None:
+                parts.append(region.lone(bool(method.corrected)))
+                call = f"lone_{r}(s, c, b, k, t, soft, out)"
+        elif region is not None:
             parts.append(region.event(place, values))
             call = f"event_{r}(blocks, c, g, k, held, s, w, mode)"
         else:
-            forms = f"(s)->forms + {2 * r}, (s)->forms + {2 * r + 1}"
-            call = f"tabulated_event({forms}, blocks, first, c, g, held, s, w, mode)"
+            arguments = f"{forms}, {forms} + 1, blocks, first, c, g, held, s, w, mode"
+            call = f"tabulated_event({arguments})"
         cases += f"case {r}: {call}; break; "
-    arguments = "region, blocks, first, c, g, k, held, s, w, mode"
-    parts.append(f"#define EVENT({arguments}) switch (region) {{ {cases}}}")
-    library = native.load("\n".join([*parts, native.template("events.c")]))
+    head = "EVENT(region, blocks, first, c, g, k, held, s, w, mode)"
+    if exact:
+        head = "LONE(region, s, c, cell, b, k, t, soft, count, out)"
+    parts += [f"#define {head} switch (region) {{ {cases}}}", native.template("events.c")]
+    library = native.load("\n".join([*parts, native.template("exact.c") if exact else ""]))
     library.cb_change_rates.restype = ctypes.c_double
     return library
+
+
+def packed_size(kernels: Kernels) -> int:
+    """Doubles per cell of an exact schedule: geometry, coefficients, step, nodes; whole vectors."""
+    disc = kernels.disc
+    used = disc.dim**2 + 1 + len(kernels.densities.coefficients) + 1 + -(-(disc.dim + 1) // 2)
+    return -(-used // disc.lanes) * disc.lanes

@@ -21,7 +21,8 @@ from complexbody.hessian import Quadratic
 Entry = Any  # a float, or the name of a vector of cell-wise coefficients
 
 
-def _text(entry: Entry) -> str:
+def entry_text(entry: Entry) -> str:
+    """An entry in C."""
     return repr(entry) if isinstance(entry, float) else str(entry)
 
 
@@ -64,7 +65,7 @@ def straight_line(
             lines.append(f"const vec {tag}{number} = {text};")
             text = f"{tag}{number}"
         for row, entry in pattern:
-            terms[row].append(text if entry == 1.0 else f"{_text(entry)} * {text}")
+            terms[row].append(text if entry == 1.0 else f"{entry_text(entry)} * {text}")
     seen: dict[str, str] = {}
     for row, output in zip(rows, outputs, strict=True):
         value = " + ".join(terms[row]) or "(vec){0}"
@@ -127,7 +128,7 @@ class RegionSource:
             return b
         if isinstance(a, float) and isinstance(b, float):
             return a + b
-        return f"({_text(a)} + {_text(b)})"
+        return f"({entry_text(a)} + {entry_text(b)})"
 
     @property
     def needs_volume(self) -> bool:
@@ -174,53 +175,6 @@ class RegionSource:
                 *self._gradient_lines(),
                 *self._force_lines([]),
                 *(f"scatter(f, c + {a} * W, f{a});" for a in nodes),
-            ],
-        )
-
-    def stress_rows(self) -> list[tuple[Any, ...]]:
-        """What each of the n·d stresses is made of: equal rows are equal stresses."""
-        own = self.gradients + self.values
-        return [
-            tuple((j, _text(self.total[i, j])) for j in own if (i, j) in self.total)
-            for i in self.gradients
-        ]
-
-    def event(self, slots: Sequence[int], values: bool) -> str:
-        """Source of ``event_r``: force at the drifted positions (against the reference), kick.
-
-        Args:
-            slots: Place of each of the n·d stresses among the references; none without a reference.
-            values: n mean self-actions z stand behind them.
-        """
-        d, n, nodes = self.dim, self.n, range(self.dim + 1)
-        lines = self._gradient_lines("gather_records(s, c + a * W, q[a])")
-        between = ["ahead(b, GEOMETRY);"]
-        if slots:
-            kept = {slot: f"left[{slot}] = s_[{i}];" for i, slot in enumerate(slots)}
-            against = [f"s_[{i}] -= reference[{slot}];" for i, slot in enumerate(slots)]
-            if values:
-                first = len(kept)
-                kept |= {first + i: f"left[{first + i}] = z[{i}];" for i in range(n)}
-                at = [f"reference[{first + i}] * b[{d * d}] / {d + 1}.0" for i in range(n)]
-                against += [f"p[{i}] -= {at[i]};" for i in range(n)]
-            between += [
-                "const vec *reference = (const vec *)(held + m * REFERENCES * W);",
-                "ahead(reference, REFERENCES);",
-                f"if (mode & KEEP) {{ vec left[REFERENCES]; {' '.join(kept.values())}",
-                f"  keep(s, c, b[{d * d}], left); }}",
-                f"if (mode & AGAINST) {{ {' '.join(against)} }}",
-            ]
-        # There are fewer stresses than forces: they take the weight.
-        between += [f"s_[{i}] *= weight;" for i in range(n * d)]
-        between += [f"p[{i}] *= weight;" for i in range(n)]
-        return self._loop(
-            f"static void event_{self.number}(int64_t blocks, const int32_t *restrict c, "
-            "const double *restrict geometry, const double *restrict coefficient, "
-            "const double *restrict held, const world *s, double weight, int mode)",
-            [
-                *lines,
-                *self._force_lines(between, with_values=values and bool(slots), weight="weight * "),
-                *(f"kick(s, c + {a} * W, 1.0, f{a});" for a in nodes),
             ],
         )
 
@@ -307,12 +261,12 @@ class RegionSource:
                         f"e += 0.5 * r * r / {factor} * c{a}_{i} * {inputs[i]};" for i in range(n)
                     ]
             body += [
-                f"e += r * {_text(v)} * {names[order.index(i)]};"
+                f"e += r * {entry_text(v)} * {names[order.index(i)]};"
                 for i, v in linear.items()
                 if i in order
             ]
             if constant != 0.0:
-                body.append(f"e += r * r * {_text(constant)};")
+                body.append(f"e += r * r * {entry_text(constant)};")
             body.append(f"for (int l = 0; l < W; l++) out[{number}] += e[l]; }}")
         return self._loop(
             f"static void energy_{self.number}(int64_t blocks, const int32_t *restrict c, "

@@ -4,7 +4,6 @@
 The reference (windows_reference.py) is the paper's recursion with a heap of events, in numpy.
 """
 
-import ctypes
 import itertools
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -21,7 +20,8 @@ from verification.windows_reference import Quadratic, Quartic, Windows
 
 import complexbody as cb
 from complexbody import _compat, meshes, native
-from complexbody.integrators.asynchronous import AVI, KEEP, AVIRun
+from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.window_run import KEEP, WindowRun
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps, critical_step
 
@@ -177,8 +177,8 @@ def traction_nodes(points, cells):
     return out
 
 
-def reference(run, case):
-    """The same scene for the reference."""
+def reference(run, case, make=None):
+    """The same scene for the reference, windows by default; ``make`` is given what it is made of."""
     method, mesh = run.method, run.problem.scene.mesh
     points, cells = whole(mesh)
     x = np.pad(points, ((0, 0), (0, 3 - case.dim))).T
@@ -229,9 +229,14 @@ def reference(run, case):
     size = 0.4 if any(case.quartic) else 1.0
     given = [wave(m, s, size)(x).T for s, m in enumerate((n_u, k) * 2)]
     q, rates = np.hstack(given[:2]), np.hstack(given[2:])
-    out = Windows(
-        cells, potentials, divisions_of(run), run.step, masses, viscosities, q, rates, fixed,
-        targets, [], method.balanced, method.passes, method.filter, method.dissipation,
+    given = {
+        "cells": cells, "potentials": potentials, "window": run.step, "masses": masses,
+        "viscosities": viscosities, "q": q, "rates": rates, "fixed": fixed, "targets": targets,
+        "scheme": method.dissipation,
+    }  # fmt: skip
+    out = make(**given) if make else Windows(
+        divisions=divisions_of(run), balanced=method.balanced, passes=method.passes,
+        filter=method.filter, **given,
     )  # fmt: skip
     if case.loads:
         side, zero = traction_nodes(points, cells), np.zeros((len(points), n))
@@ -597,13 +602,10 @@ def window_map(run):
     out = np.zeros((parts * size, parts * size))
     for j, unit in enumerate(np.eye(parts * size).reshape(-1, parts, size)):
         run.steps = 1
-        for q, kept in ((unit[-1], "_old"), (unit[0], "stress")) if balanced else ():
+        for q, kept in ((unit[-1], "old"), (unit[0], "stress")) if balanced else ():
             put(q, 0.0)
-            run.c.cb_together(
-                run._world, ctypes.c_int64(0), ctypes.c_int64(run.plan.count),
-                ctypes.c_double(run.time), ctypes.c_double(0.0), KEEP,
-            )  # fmt: skip
-            np.copyto(getattr(run, kept), run.stress)
+            run._together(run.time, KEEP, 0.0)
+            np.copyto(getattr(run.balance, kept), run.balance.stress)
         put(unit[0], unit[1])
         run.advance(1)
         out[:size, j] = run.record[rows, columns]
@@ -677,7 +679,7 @@ def two_rates(ratio, safety, viscosity=0.0):
     coarse = corner < float(10 * ratio * length) - 1e-9
     problem.arrange(np.where(coarse, ratio.denominator, ratio.numerator))
     window = safety * float(ratio * length) * ratio.denominator
-    return AVIRun(problem, AVI(balanced=False), window, 1.0)
+    return WindowRun(problem, AVI(balanced=False), window, 1.0)
 
 
 @pytest.mark.serial

@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""The tables of an exact schedule: cells packed for single use, other ranks' visits, messages.
+
+Every rank knows the steps of the other ranks' cells that touch its nodes, hence when they act: it
+needs to be sent their kicks only. Made once; a span allocates nothing.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from complexbody import _compat, native
+from complexbody.kernels.events import packed_size
+from complexbody.problem import Problem
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+_TAG = 8
+
+
+class Schedule(ctypes.Structure):
+    """Mirror of ``schedule`` in exact.c."""
+
+    _fields_ = (
+        ("cells", ctypes.c_int64), ("visits", ctypes.c_int64),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("packed", "region", "step", "counter", "number", "row", "row_node",
+                         "time", "who", "next", "link", "waits", "last", "stack", "bucket")
+        ),
+        ("buckets", ctypes.c_int64),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("head", "tail", "kicks", "rows_of", "rows", "row_neighbour", "row_place",
+                         "outgoing", "out_start", "out_count")
+        ),
+        *((name, ctypes.c_int64) for name in ("first_shared", "last_shared", "events", "top", "done")),
+        ("trapezoidal", ctypes.c_int32),
+    )  # fmt: skip
+
+
+class ExactSchedule:
+    """Cells, visits and messages of a run whose cells step as they like; collective.
+
+    Args:
+        problem: The scene.
+        steps: h_K in blocks (blocks, W) [s]; infinite for padding.
+        span: Length of the stretches of time that are scheduled at once [s].
+        trapezoidal: Cells' first kicks are halves.
+
+    Attributes:
+        state: What the C functions read.
+        most: Most events of this rank in a span, visits included.
+        counter: j of each cell's next event, then of each visit's.
+    """
+
+    def __init__(self, problem: Problem, steps: Array, span: float, trapezoidal: bool) -> None:
+        disc, kernels = problem.disc, problem.kernels
+        self.halo, self.comm, self.n = disc.halo, problem.comm, disc.n
+        cells = disc.blocks * disc.lanes
+        original = _compat.original_cells(problem.scene.mesh)
+        source = disc.source_cell.ravel()
+        number = np.where(source >= 0, original[np.maximum(source, 0)], -1)
+        rows = len(disc.halo.sends)
+        visits = self._visits(disc, steps, number)
+        every = np.concatenate([steps.ravel(), visits["step"]])
+        self.counter = np.zeros(len(every), np.int64)
+        with np.errstate(divide="ignore"):
+            self.most = int(np.sum(np.ceil(span / every) + 1))
+        buckets = max(self.most // 4, 1)
+        self.state = state = Schedule(cells, len(visits["row"]))
+        slots = disc.dim + 1
+        neighbour = np.repeat(np.arange(len(self.halo.neighbours)), self._sizes)
+        place = np.arange(rows) - np.repeat(self._offsets, self._sizes)
+        kicks = np.zeros(len(self.halo.neighbours), np.int64)
+        np.add.at(kicks, neighbour, self._sent(disc, steps, span))
+        self._starts = np.concatenate([[0], np.cumsum(kicks)])
+        by_node = np.argsort(self.halo.sends, kind="stable")
+        self.arrays: dict[str, Array | Ints | npt.NDArray[Any]] = {
+            "packed": self._pack(problem, steps), "step": every, "counter": self.counter,
+            "region": np.repeat(disc.region, disc.lanes).astype(np.int32),
+            "number": np.concatenate([number, visits["number"]]),
+            "row": visits["row"].astype(np.int32),
+            "row_node": (disc.late + self.halo.sends).astype(np.int32),
+            "time": np.zeros(self.most), "waits": np.zeros(self.most, np.uint8),
+            "who": np.zeros(self.most, np.int32), "link": np.zeros(self.most, np.int32),
+            "stack": np.zeros(self.most, np.int32), "bucket": np.zeros(buckets + 1, np.int32),
+            "next": np.zeros((self.most, slots), np.int32),
+            "last": np.zeros(disc.nodes + 1, np.int32),
+            "head": np.zeros(rows, np.int32), "tail": np.zeros(rows, np.int32),
+            "kicks": np.zeros((self.most if rows else 1, disc.n)),
+            "rows_of": np.searchsorted(
+                self.halo.sends[by_node], np.arange(disc.shared + 1)
+            ).astype(np.int32),
+            "rows": by_node.astype(np.int32), "row_neighbour": neighbour.astype(np.int32),
+            "row_place": place.astype(np.int32),
+            "outgoing": np.zeros((int(self._starts[-1]), 1 + disc.n)),
+            "out_start": self._starts[:-1].copy(),
+            "out_count": np.zeros(len(kicks), np.int64),
+        }  # fmt: skip
+        for name, array in self.arrays.items():
+            setattr(state, name, native.pointer(array).value)
+        state.buckets, state.trapezoidal = buckets, int(trapezoidal)
+        state.first_shared, state.last_shared = disc.late, disc.late + disc.shared
+        self._incoming = [
+            np.zeros((int(np.sum(np.ceil(span / visits["step"][visits["from"] == i]) + 1)), 1 + self.n))
+            for i in range(len(self.halo.neighbours))
+        ]
+        self._from = visits["from"]
+
+    def _visits(self, disc: Any, steps: Array, number: Ints) -> dict[str, Any]:
+        """Visits that other ranks' cells will make to this rank's nodes: step, number, row, from."""
+        halo, comm = disc.halo, disc.comm
+        self._sizes = np.zeros(len(halo.neighbours), np.int64)
+        rows_of: list[dict[int, int]] = []
+        starts = halo.starts if len(halo.neighbours) else np.zeros(1, np.int64)
+        self._offsets = np.asarray(starts[:-1], np.int64)
+        self._sizes = np.diff(starts).astype(np.int64)
+        for first, size in zip(self._offsets, self._sizes, strict=True):
+            nodes = disc.late + halo.sends[first : first + size]
+            rows_of.append({int(a): i for i, a in enumerate(nodes)})
+        # Cells at shared nodes come first.
+        blocks = np.arange(disc.boundary_blocks)
+        told: list[tuple[Array, Ints, Ints]] = [
+            (np.zeros(0), np.zeros(0, np.int64), np.zeros(0, np.int64)) for _ in range(comm.size)
+        ]
+        self._touches: list[tuple[Ints, Ints]] = []
+        for rank, table in zip(halo.neighbours, rows_of, strict=True):
+            lookup = np.full(disc.nodes + 1, -1, np.int64)
+            lookup[list(table)] = list(table.values())
+            at = lookup[disc.cells[blocks]]  # (blocks, d+1, W)
+            block, _, lane = np.nonzero(at >= 0)
+            cell = block * disc.lanes + lane
+            told[rank] = (steps.ravel()[cell], number[cell], at[at >= 0])
+            self._touches.append((cell, at[at >= 0]))
+        heard = comm.alltoall(told) if comm.size > 1 else []
+        parts = [heard[rank] for rank in halo.neighbours]
+        empty = np.zeros(0, np.int64)
+        return {
+            "step": np.concatenate([p[0] for p in parts] or [np.zeros(0)]),
+            "number": np.concatenate([p[1] for p in parts] or [empty]),
+            "row": np.concatenate(
+                [p[2] + first for p, first in zip(parts, self._offsets, strict=True)] or [empty]
+            ),
+            "from": np.repeat(np.arange(len(parts)), [len(p[0]) for p in parts]),
+        }
+
+    def _sent(self, disc: Any, steps: Array, span: float) -> Ints:
+        """Most kicks that this rank sends in a span for each row of the table."""
+        out = np.zeros(len(self.halo.sends), np.int64)
+        for first, (cell, place) in zip(self._offsets, self._touches, strict=True):
+            most = np.ceil(span / steps.ravel()[cell]).astype(np.int64) + 1
+            np.add.at(out, first + place, most)
+        return out
+
+    def _pack(self, problem: Problem, steps: Array) -> Array:
+        """Cells one after the other: geometry, coefficients, h_K, nodes (cells, PACKED)."""
+        disc, kernels = problem.disc, problem.kernels
+        size, count = packed_size(kernels), len(kernels.densities.coefficients)
+        out = native.aligned((disc.blocks, disc.lanes, size))
+        used = disc.dim**2 + 1
+        out[:, :, :used] = disc.geometry.transpose(0, 2, 1)
+        if count:
+            out[:, :, used : used + count] = kernels.coefficients.transpose(0, 2, 1)
+        out[:, :, used + count] = np.where(np.isfinite(steps), steps, 0.0)
+        nodes = out.view(np.int32)[:, :, 2 * (used + count + 1) :]
+        nodes[:, :, : disc.dim + 1] = disc.cells.transpose(0, 2, 1)
+        return out
+
+    # --- a span ------------------------------------------------------------------------------
+
+    def run(self, c: Any, world: Any, start: float, end: float) -> int:
+        """Do all events with start ≤ t < end; collective. Returns how many cells of this rank did."""
+        state, ahead = self.state, ctypes.byref(self.state)
+        j0 = self.counter.copy() if len(self._from) else self.counter
+        rows = ctypes.c_int64(len(self.halo.sends))
+        events = c.cb_exact_schedule(
+            world, ahead, ctypes.c_double(start), ctypes.c_double(end), rows
+        )
+        assert events <= self.most
+        c.cb_exact_go(world, ahead)
+        visited = 0
+        if len(self.halo.neighbours):
+            made = self.counter - j0
+            visited = int(made[state.cells :].sum())
+            awaited = np.bincount(
+                self._from, weights=made[state.cells :], minlength=len(self.halo.neighbours)
+            ).astype(np.int64)
+            owed = np.array([int(made[cell].sum()) for cell, _ in self._touches], np.int64)
+            self._rounds(c, world, awaited, owed)
+        assert state.done == state.events, "events wait for what never comes"
+        return int(events) - visited
+
+    def _rounds(self, c: Any, world: Any, awaited: Ints, owed: Ints) -> None:
+        """Send kicks, take kicks, go on: as long as any neighbour has some to send or to get."""
+        comm, ahead, width = self.halo.comm, ctypes.byref(self.state), 1 + self.n
+        counts, outgoing = self.arrays["out_count"], self.arrays["outgoing"]
+        pairs = list(enumerate(self.halo.neighbours))
+        while awaited.any() or owed.any():
+            requests, status, open_ = [], [], []
+            for i, rank in pairs:
+                if awaited[i]:
+                    requests.append(comm.Irecv([self._incoming[i], MPI.DOUBLE], rank, _TAG))
+                    open_.append(i)
+            for i, rank in pairs:
+                if owed[i]:
+                    first, count = int(self._starts[i]), int(counts[i])
+                    part = outgoing[first : first + count]
+                    requests.append(comm.Isend([part, part.size, MPI.DOUBLE], rank, _TAG))
+                    owed[i] -= count
+            status = [MPI.Status() for _ in requests]
+            MPI.Request.Waitall(requests, status)
+            counts[:] = 0
+            for i, told in zip(open_, status, strict=False):
+                count = told.Get_count(MPI.DOUBLE) // width
+                awaited[i] -= count
+                c.cb_exact_deliver(
+                    world, ahead, ctypes.c_int64(int(self._offsets[i])),
+                    native.pointer(self._incoming[i]), ctypes.c_int64(count),
+                )  # fmt: skip
+            c.cb_exact_go(world, ahead)
