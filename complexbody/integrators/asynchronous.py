@@ -19,6 +19,7 @@ import numpy.typing as npt
 from complexbody.errors import IntegratorError, StepError, agree
 from complexbody.integrators.exact_run import ExactRun
 from complexbody.integrators.window_run import WindowRun
+from complexbody.integrators.exact_schedule import span_length
 from complexbody.integrators.windows import divisions, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
@@ -137,7 +138,7 @@ class AVI:
             # A cell without stiffness of its own acts once per span.
             blocks = np.full(critical.shape, np.inf)
             blocks[real] = np.where(np.isfinite(steps), steps, window)[disc.source_cell[real]]
-            return ExactRun(problem, self, window, blocks, own)
+            return ExactRun(problem, self, span_length(blocks, until, problem.comm), blocks, own)
         problem.arrange(divisions(steps, window, self.schedule == "octaves"))
         return WindowRun(problem, self, window, own)
 

@@ -23,6 +23,26 @@ Ints = npt.NDArray[np.int64]
 _TAG = 8
 
 
+#: A span has about so many events, or a quarter of an event per cell: its arrays stay in a cache,
+#: and little is lost in going through all cells for it.
+EVENTS, PER_CELL = 50_000, 0.25
+
+
+def span_length(steps: Array, until: float, comm: Any) -> float:
+    """Length of a span [s], at most the largest step; ``until`` ends one.
+
+    Args:
+        steps: h_K of this rank's cells [s], infinite for padding.
+        until: End of the run [s].
+        comm: Communicator; collective.
+    """
+    finite = steps[np.isfinite(steps)]
+    count, rate = comm.allreduce(np.array([len(finite), np.sum(1.0 / finite)]))
+    largest = comm.allreduce(float(finite.max(initial=0.0)), op=MPI.MAX)
+    span = min(max(EVENTS, PER_CELL * count) / rate, largest, until)
+    return float(until / np.ceil(until / span * (1 - 1e-12)))
+
+
 class Schedule(ctypes.Structure):
     """Mirror of ``schedule`` in exact.c."""
 
@@ -30,8 +50,8 @@ class Schedule(ctypes.Structure):
         ("cells", ctypes.c_int64), ("visits", ctypes.c_int64),
         *(
             (name, ctypes.c_void_p)
-            for name in ("packed", "region", "step", "counter", "number", "row", "row_node",
-                         "time", "who", "next", "link", "waits", "last", "stack", "bucket")
+            for name in ("packed", "node", "region", "step", "counter", "actor", "index", "row", "row_node",
+                         "list", "event", "link", "last", "stack", "bucket")
         ),
         ("buckets", ctypes.c_int64),
         *(
@@ -56,7 +76,7 @@ class ExactSchedule:
     Attributes:
         state: What the C functions read.
         most: Most events of this rank in a span, visits included.
-        counter: j of each cell's next event, then of each visit's.
+        counter: j of the next event of cells and visits, by global number.
     """
 
     def __init__(self, problem: Problem, steps: Array, span: float, trapezoidal: bool) -> None:
@@ -69,12 +89,19 @@ class ExactSchedule:
         rows = len(disc.halo.sends)
         visits = self._visits(disc, steps, number)
         every = np.concatenate([steps.ravel(), visits["step"]])
+        # By global number: events at one time come in this order on every rank.
+        order = np.argsort(np.concatenate([number, visits["number"]]), kind="stable")
+        self._index = np.argsort(order)
+        every = every[order]
         self.counter = np.zeros(len(every), np.int64)
         with np.errstate(divide="ignore"):
             self.most = int(np.sum(np.ceil(span / every) + 1))
         buckets = max(self.most // 4, 1)
         self.state = state = Schedule(cells, len(visits["row"]))
-        slots = disc.dim + 1
+        event = np.dtype(
+            [("time", "f8"), ("actor", "i4"), ("waits", "i4"), ("next", "i4", disc.dim + 1)],
+            align=True,
+        )
         neighbour = np.repeat(np.arange(len(self.halo.neighbours)), self._sizes)
         place = np.arange(rows) - np.repeat(self._offsets, self._sizes)
         kicks = np.zeros(len(self.halo.neighbours), np.int64)
@@ -82,15 +109,15 @@ class ExactSchedule:
         self._starts = np.concatenate([[0], np.cumsum(kicks)])
         by_node = np.argsort(self.halo.sends, kind="stable")
         self.arrays: dict[str, Array | Ints | npt.NDArray[Any]] = {
-            "packed": self._pack(problem, steps), "step": every, "counter": self.counter,
+            "packed": self._pack(problem, steps), "step": every,
+            "node": np.ascontiguousarray(disc.cells.transpose(0, 2, 1)), "counter": self.counter,
             "region": np.repeat(disc.region, disc.lanes).astype(np.int32),
-            "number": np.concatenate([number, visits["number"]]),
+            "actor": order.astype(np.int32), "index": self._index.astype(np.int32),
             "row": visits["row"].astype(np.int32),
             "row_node": (disc.late + self.halo.sends).astype(np.int32),
-            "time": np.zeros(self.most), "waits": np.zeros(self.most, np.uint8),
-            "who": np.zeros(self.most, np.int32), "link": np.zeros(self.most, np.int32),
+            "list": np.zeros((self.most, 2)), "event": np.zeros(self.most, event),
+            "link": np.zeros(self.most, np.int32),
             "stack": np.zeros(self.most, np.int32), "bucket": np.zeros(buckets + 1, np.int32),
-            "next": np.zeros((self.most, slots), np.int32),
             "last": np.zeros(disc.nodes + 1, np.int32),
             "head": np.zeros(rows, np.int32), "tail": np.zeros(rows, np.int32),
             "kicks": np.zeros((self.most if rows else 1, disc.n)),
@@ -186,7 +213,7 @@ class ExactSchedule:
         c.cb_exact_go(world, ahead)
         visited = 0
         if len(self.halo.neighbours):
-            made = self.counter - j0
+            made = (self.counter - j0)[self._index]
             visited = int(made[state.cells :].sum())
             awaited = np.bincount(
                 self._from, weights=made[state.cells :], minlength=len(self.halo.neighbours)

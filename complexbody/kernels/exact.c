@@ -8,21 +8,32 @@
  * rank's event is a *visit* to each shared node it touches: it waits for its kick to come in, too. So
  * every node sees all its events in the one order, whatever the number of ranks. */
 
+#include <stdlib.h>
+
 #define SLOTS (DIM + 1)
 #define STEP (GEOMETRY + COEFFICIENTS) /* in a packed cell: geometry, coefficients, h_K, nodes */
+
+typedef struct { double time; int64_t index; } entry; /* before it is known who waits for whom */
+typedef struct {
+  double time;
+  int32_t actor, waits;    /* cell, or cells + visit; for so many others, and for a kick to come in */
+  int32_t next[SLOTS];     /* who waits for it at each of its nodes, or -1 */
+} event;
 
 typedef struct {
   int64_t cells, visits;    /* slots of cells (padding included), visits by other ranks' cells */
   const double *packed;     /* [cell][PACKED] */
+  const int32_t *node;      /* [cell][SLOTS]: once more, close together */
   const int32_t *region;    /* [cell] */
-  const double *step;       /* [cell + visit], infinite for padding */
-  int64_t *counter;         /* [cell + visit]: the next event's j */
-  const int64_t *number;    /* [cell + visit]: global number of the cell */
+  const double *step;       /* of cells and visits by global number: [index]; infinite for padding */
+  int64_t *counter;         /* [index]: the next event's j */
+  const int32_t *actor;     /* [index]: cell, or cells + visit */
+  const int32_t *index;     /* [cell] */
   const int32_t *row;       /* [visit]: row of the receive table, node and neighbour */
   const int32_t *row_node;  /* [row]: node */
-  double *time;             /* a span's events in their order: [event] */
-  int32_t *who, *next, *link; /* cell or visit; [event][SLOTS] who waits for it; next visit of a row */
-  uint8_t *waits;           /* [event]: for so many others, and for a kick to come in */
+  entry *list;              /* a span's events in their order */
+  event *event;
+  int32_t *link;            /* [event]: next visit of a row */
   int32_t *last;            /* [node]: last event so far and its slot */
   int32_t *stack;           /* [event] */
   int32_t *bucket;          /* [buckets + 1] */
@@ -39,15 +50,15 @@ typedef struct {
   int32_t trapezoidal;
 } schedule;
 
-static const int32_t *nodes_of(const schedule *x, int64_t cell) {
-  return (const int32_t *)(x->packed + cell * PACKED + STEP + 1);
+#define AHEAD 12 /* events whose data is fetched while earlier ones are worked on */
+
+/* By time; of two at one time the cell of the smaller global number. */
+static int by_time(const void *a, const void *b) {
+  const entry *e = a, *f = b;
+  return e->time < f->time ? -1 : e->time > f->time ? 1 : (e->index > f->index) - (e->index < f->index);
 }
 
-static int before(const schedule *x, double t, int32_t a, double u, int32_t b) {
-  return t < u || (t == u && x->number[a] < x->number[b]);
-}
-
-/* Events with t0 <= t < t1 in the order of time. */
+/* Events with t0 <= t < t1 in their order: into buckets of time, then bucket by bucket. */
 static void in_order(schedule *x, double t0, double t1) {
   const int64_t all = x->cells + x->visits;
   const double scale = x->buckets / (t1 - t0);
@@ -63,32 +74,33 @@ static void in_order(schedule *x, double t0, double t1) {
   for (int64_t i = 0; i < all; i++) {
     const double h = x->step[i];
     int64_t j = x->counter[i];
-    for (; j * h < t1; j++) {
-      const int32_t at = x->bucket[BUCKET(j * h)]++;
-      x->time[at] = j * h;
-      x->who[at] = (int32_t)i;
-    }
+    for (; j * h < t1; j++) x->list[x->bucket[BUCKET(j * h)]++] = (entry){j * h, i};
     x->counter[i] = j;
   }
-  for (int64_t e = 1; e < x->events; e++) { /* nearly sorted by now */
-    const double t = x->time[e];
-    const int32_t w = x->who[e];
-    int64_t f = e;
-    for (; f > 0 && before(x, t, w, x->time[f - 1], x->who[f - 1]); f--) {
-      x->time[f] = x->time[f - 1];
-      x->who[f] = x->who[f - 1];
+  for (int64_t b = 0, first = 0; b < x->buckets; first = x->bucket[b++]) {
+    entry *e = x->list + first;
+    const int64_t count = x->bucket[b] - first;
+    if (count > 24) {
+      int64_t sorted = 1; /* meshes of equal cells give crowds of equal times, in order already */
+      while (sorted < count && e[sorted - 1].time <= e[sorted].time) sorted++;
+      if (sorted < count) qsort(e, count, sizeof(entry), by_time);
+    } else {
+      for (int64_t i = 1; i < count; i++) {
+        const entry moved = e[i];
+        int64_t f = i;
+        for (; f > 0 && e[f - 1].time > moved.time; f--) e[f] = e[f - 1];
+        e[f] = moved;
+      }
     }
-    x->time[f] = t;
-    x->who[f] = w;
   }
 }
 
 /* Event e acts on a node behind the last one there, and waits for it. */
-INLINE void follow(schedule *x, int32_t node, int32_t e, int slot, int *waits) {
+INLINE void follow(schedule *x, int32_t node, int32_t e, int slot) {
   const int32_t p = x->last[node];
   if (p >= 0) {
-    x->next[p] = e;
-    ++*waits;
+    x->event[p / SLOTS].next[p % SLOTS] = e;
+    x->event[e].waits++;
   }
   x->last[node] = e * SLOTS + slot;
 }
@@ -98,34 +110,42 @@ int64_t cb_exact_schedule(const world *s, schedule *x, double t0, double t1, int
   in_order(x, t0, t1);
   for (int64_t a = 0; a <= s->nodes; a++) x->last[a] = -1;
   for (int64_t r = 0; r < rows; r++) x->head[r] = x->tail[r] = -1;
-  memset(x->next, -1, x->events * SLOTS * sizeof(int32_t));
   x->top = x->done = 0;
   for (int32_t e = 0; e < x->events; e++) {
-    const int32_t w = x->who[e];
-    int waits = 0;
+    const int32_t w = x->actor[x->list[e].index];
+    if (e + 2 * AHEAD < x->events) {
+      const int32_t far = x->actor[x->list[e + 2 * AHEAD].index], v = x->actor[x->list[e + AHEAD].index];
+      if (far < x->cells) __builtin_prefetch(x->node + (int64_t)far * SLOTS);
+      if (v < x->cells)
+        for (int a = 0; a <= DIM; a++) __builtin_prefetch(x->last + x->node[(int64_t)v * SLOTS + a], 1);
+    }
+    event *now = x->event + e;
+    *now = (event){x->list[e].time, w, 0, {0}};
+    for (int a = 0; a <= DIM; a++) now->next[a] = -1;
     if (w < x->cells) {
-      const int32_t *c = nodes_of(x, w);
-      for (int a = 0; a <= DIM; a++) follow(x, c[a], e, a, &waits);
+      const int32_t *c = x->node + (int64_t)w * SLOTS;
+      for (int a = 0; a <= DIM; a++) follow(x, c[a], e, a);
     } else {
       const int32_t row = x->row[w - x->cells];
-      follow(x, x->row_node[row], e, 0, &waits);
-      waits++;
+      follow(x, x->row_node[row], e, 0);
+      now->waits++;
       x->link[e] = -1;
       if (x->tail[row] < 0) x->head[row] = e; else x->link[x->tail[row]] = e;
       x->tail[row] = e;
     }
-    x->waits[e] = (uint8_t)waits;
   }
   for (int64_t e = x->events - 1; e >= 0; e--) /* the earliest on top */
-    if (!x->waits[e]) x->stack[x->top++] = (int32_t)e;
+    if (!x->event[e].waits) x->stack[x->top++] = (int32_t)e;
   return x->events;
 }
 
 /* Event e waits for one less; visits are done at once. */
 static void release(const world *s, schedule *x, int32_t e) {
-  while (e >= 0 && --x->waits[e] == 0) {
-    const int32_t w = x->who[e];
+  while (e >= 0 && --x->event[e].waits == 0) {
+    const int32_t w = x->event[e].actor;
     if (w < x->cells) {
+      __builtin_prefetch(x->node + (int64_t)w * SLOTS);
+      for (int i = 0; i < PACKED; i += 8) __builtin_prefetch(x->packed + (int64_t)w * PACKED + i);
       x->stack[x->top++] = e;
       return;
     }
@@ -133,10 +153,10 @@ static void release(const world *s, schedule *x, int32_t e) {
     double *r = record_of(s, a);
     int32_t some[W];
     for (int l = 0; l < W; l++) some[l] = (int32_t)a;
-    drift(s, some, (vec){0} + x->time[e]);
+    drift(s, some, (vec){0} + x->event[e].time);
     impulse(s, a, x->kicks + (int64_t)e * N, r[INVERSE], r + NR);
     x->done++;
-    e = x->next[(int64_t)e * SLOTS];
+    e = x->event[e].next[0];
   }
 }
 
@@ -156,15 +176,15 @@ static void emit(const schedule *x, const int32_t *c, const vec weight, const ve
 }
 
 /* `count` events of one region that share no node act. */
-static void act_alone(const world *s, schedule *x, const int32_t *event, int count) {
+static void act_alone(const world *s, schedule *x, const int32_t *which, int count) {
   vec b[PACKED], out[DIM + 1][NR], t, weight;
   int32_t c[SLOTS * W], cell[W];
   const double *row[W];
   for (int l = 0; l < W; l++) {
-    const int32_t e = event[l < count ? l : 0];
-    cell[l] = x->who[e];
+    const event *e = x->event + which[l < count ? l : 0];
+    cell[l] = e->actor;
     row[l] = x->packed + (int64_t)cell[l] * PACKED;
-    t[l] = x->time[e];
+    t[l] = e->time;
     const int32_t *node = (const int32_t *)(row[l] + STEP + 1);
     for (int a = 0; a <= DIM; a++) c[a * W + l] = l < count ? node[a] : (int32_t)s->nodes;
   }
@@ -185,20 +205,36 @@ static void act_alone(const world *s, schedule *x, const int32_t *event, int cou
   if (x->last_shared > x->first_shared)
     for (int a = 0; a <= DIM; a++) emit(x, c + a * W, weight, out[a], count);
   for (int l = 0; l < count; l++)
-    for (int a = 0; a <= DIM; a++) release(s, x, x->next[(int64_t)event[l] * SLOTS + a]);
+    for (int a = 0; a <= DIM; a++) release(s, x, x->event[which[l]].next[a]);
   x->done += count;
 }
 
-/* Do all events that wait for nothing. */
+/* Up to W events of one region that wait for nothing; their data is on its way. */
+static int take(const world *s, schedule *x, int32_t *which) {
+#define REGION(e) x->region[x->event[e].actor]
+  int count = 0;
+  while (count < W && x->top > 0 &&
+         (!count || REGION(x->stack[x->top - 1]) == REGION(which[0]))) {
+    const int32_t e = which[count++] = x->stack[--x->top];
+    const int32_t *c = x->node + (int64_t)x->event[e].actor * SLOTS;
+    for (int a = 0; a <= DIM; a++) {
+      for (int i = 0; i < RECORD; i += 8) __builtin_prefetch(record_of(s, c[a]) + i, 1);
+      if (x->event[e].next[a] >= 0) __builtin_prefetch(x->event + x->event[e].next[a], 1);
+    }
+  }
+  return count;
+}
+
+/* Do all events that wait for nothing: each lot is taken before the last one acts, so that its data
+ * has time to come. Events that wait for nothing share no node. */
 void cb_exact_go(const world *s, schedule *x) {
-  while (x->top > 0) {
-    int32_t some[W];
-    int count = 1;
-    some[0] = x->stack[--x->top];
-    const int32_t region = x->region[x->who[some[0]]];
-    while (count < W && x->top > 0 && x->region[x->who[x->stack[x->top - 1]]] == region)
-      some[count++] = x->stack[--x->top];
-    act_alone(s, x, some, count);
+  int32_t lots[2][W];
+  int now = 0, count = take(s, x, lots[0]);
+  while (count > 0) {
+    const int more = take(s, x, lots[1 - now]);
+    act_alone(s, x, lots[now], count);
+    now = 1 - now;
+    count = more > 0 ? more : take(s, x, lots[now]);
   }
 }
 
@@ -226,8 +262,9 @@ void cb_exact_complete(const world *s, const schedule *x, int64_t blocks, double
     int count = 0;
     for (int l = 0; l < W; l++) {
       cell[l] = (int32_t)(m * W + l);
-      const double h = x->step[cell[l]];
-      const int64_t j = x->counter[cell[l]];
+      const int32_t i = x->index[cell[l]];
+      const double h = x->step[i];
+      const int64_t j = x->counter[i];
       if (c[l] >= s->nodes) continue;
       count = l + 1;
       if (j > 0) weight[l] = x->trapezoidal ? t - (j - 0.5) * h : t - j * h;
