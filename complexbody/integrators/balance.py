@@ -28,8 +28,8 @@ class Balance:
         run: The run whose cells act against it.
 
     Attributes:
-        reference, stress, old: Smoothed, last and last but one stresses (blocks, values, W), times
-            √|K|.
+        reference: Smoothed stresses of cells (blocks, values, W), times √|K|.
+        stress, old: Last and last but one stresses times |K|, summed over a node's cells.
     """
 
     reference: Array
@@ -40,10 +40,11 @@ class Balance:
         self.run, problem = run, run.problem
         disc, masses = problem.disc, problem.masses
         values = max(events.references(problem.kernels), 1)
-        shape = (disc.blocks, values, disc.lanes)
-        self.reference, self.stress, self.old = (native.aligned(shape) for _ in range(3))
+        self.reference = native.aligned((disc.blocks, values, disc.lanes))
         rows = -(-values // disc.lanes) * disc.lanes
-        self._nodal = native.aligned((disc.nodes + 1, rows))
+        self.stress, self.old, self._nodal, self._smoothed = (
+            native.aligned((disc.nodes + 1, rows)) for _ in range(4)
+        )
         share = disc.geometry[:, -1, :] ** 2 / (disc.dim + 1) ** 2
         self._cell_mass = np.ascontiguousarray(cell_densities(problem) * share)
         self._inverse_node_mass = 1.0 / (masses.density[masses.classes[:-1]] * disc.volume)
@@ -55,17 +56,18 @@ class Balance:
         run, disc, c = self.run, self.run.problem.disc, self.run.c
         if first:
             np.copyto(self.old, self.stress)
-        blocks, nodal = ctypes.c_int64(disc.blocks), native.pointer(self._nodal)
-        old: Array | None = self.old
-        for _ in range(run.method.passes):
-            self._nodal[:] = 0.0
-            c.cb_to_nodes(run._world, blocks, native.pointer(old), nodal)
-            run._sum_shared(self._nodal)
-            c.cb_scale_nodes(run._world, nodal)
-            c.cb_to_cells(run._world, blocks, nodal)
-            old = None
+        blocks = ctypes.c_int64(disc.blocks)
+        now, then = self._nodal, self._smoothed
+        c.cb_carry(run._world, native.pointer(self.old), native.pointer(now))
+        for left in reversed(range(run.method.passes)):
+            run._sum_shared(now)
+            c.cb_scale_nodes(run._world, native.pointer(now))
+            if left:
+                then[:] = 0.0
+                c.cb_smooth(run._world, blocks, native.pointer(now), native.pointer(then))
+                now, then = then, now
         run._force[:] = 0.0
-        c.cb_reference_force(run._world, blocks, native.pointer(run._force))
+        c.cb_to_cells(run._world, blocks, native.pointer(now), native.pointer(run._force))
         run._add_loads(t + 0.5 * run.step)
         run._sum_shared(run._force)
         c.cb_accelerate(run._world, native.pointer(run._force))

@@ -39,7 +39,7 @@ class World(ctypes.Structure):
                 "record", "klass", "inverse_mass", "rate", "compliance", "eta", "basis",
                 "inverse_basis", "collected",
                 "groups", "cell", "geometry", "coefficient", "reference", "stress", "sums",
-                "counted", "coordinates", "forms",
+                "counted", "coordinates", "forms", "touched", "touched_from",
             )
         ),
         ("start", ctypes.c_double),

@@ -34,6 +34,7 @@ class WindowRun(RecordRun):
         self.plan = WindowPlan(problem.disc, window)
         self.time_sets = time_sets(self.plan, problem.disc, critical, window)
         self.world.groups = ctypes.addressof(self.plan.groups)
+        self._point(touched=self.plan.touched, touched_from=self.plan.touched_from)
         self.balance = Balance(self) if method.balanced else None
         if self.balance is not None:
             self._point(reference=self.balance.reference, stress=self.balance.stress)
@@ -107,9 +108,7 @@ class WindowRun(RecordRun):
         plan, c = self.plan, self.c
 
         def replay(first: int, last: int) -> None:
-            c.cb_replay(
-                self._world, plan.events, ctypes.c_int64(first), ctypes.c_int64(last), mode
-            )
+            c.cb_replay(self._world, plan.events, ctypes.c_int64(first), ctypes.c_int64(last), mode)
 
         for cut in plan.cuts:
             replay(cut.first, cut.shared)

@@ -2,9 +2,10 @@
 """Windows: which cells act when, computed once and replayed in every window.
 
 Time goes in windows W of about α times the largest critical step. Cell K makes
-N_K = ⌈W/(α h_K,crit)⌉ equal steps h_K = W/N_K in each. Cells of equal N_K act at the same times
-j W/N_K, so they form groups; events of different groups at one time commute. An elemental time set
-Θ_K is thus rational, and the order of events is the same in every window.
+N_K = ⌈W/(α h_K,crit)⌉ equal steps h_K = W/N_K in each, large N_K rounded up a little. Cells of
+equal N_K act at the same times j W/N_K, so they form groups; events of different groups at one time
+commute. An elemental time set Θ_K is thus rational, and the order of events is the same in every
+window.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from mpi4py import MPI
 
 from complexbody.discretisation import Discretisation
 from complexbody.errors import StepError
+from complexbody.kernels.events import CHUNK
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -27,12 +29,16 @@ Ints = npt.NDArray[np.int64]
 #: N_K above this is refused: a window would hold too many distinct times.
 MOST_DIVISIONS = 100_000
 
+#: N_K keeps this many binary digits behind its first: on graded meshes up to 3 % more events, and
+#: a third to half fewer drifts, since more neighbours act together.
+DIGITS = 3
+
 
 class Group(ctypes.Structure):
     """Mirror of ``group`` in events.c."""
 
     _fields_ = (
-        *((name, ctypes.c_int64) for name in ("first", "last", "region", "divisions")),
+        *((name, ctypes.c_int64) for name in ("first", "last", "region", "divisions", "chunk")),
         ("step", ctypes.c_double),
     )
 
@@ -44,7 +50,7 @@ class Happening(ctypes.Structure):
 
 
 def divisions(steps: Array, window: float, octaves: bool = False) -> Ints:
-    """N_K = ⌈W/h_K⌉ of steps (cells,) not to be exceeded [s], at least 1.
+    """N_K = ⌈W/h_K⌉ of steps (cells,) not to be exceeded [s], at least 1, rounded up from 17 on.
 
     With ``octaves`` N_K is rounded up to a power of two: fewer groups, coherent levels.
 
@@ -59,7 +65,8 @@ def divisions(steps: Array, window: float, octaves: bool = False) -> Ints:
             "different in size. Repair its smallest cells, or use a smaller window."
         )
     count = np.maximum(count, 1)
-    return 2 ** np.ceil(np.log2(count)).astype(np.int64) if octaves else count
+    unit = 1 << np.maximum(np.frexp(count)[1] - 1 - (0 if octaves else DIGITS), 0)
+    return -(-count // unit) * unit
 
 
 @dataclass(frozen=True)
@@ -113,6 +120,7 @@ class WindowPlan:
         groups: C array of groups, those touching shared nodes first.
         edge: Number of groups touching shared nodes.
         events: C array of interior events, 0 < t < W, by time; shared-node groups first.
+        touched, touched_from: Nodes that drift before each chunk of blocks acts.
         cuts: Exchanges (several ranks only), at the same times on every rank.
         every_shared: All shared nodes by position.
         updates: Cell updates per window (boundary counted once) on this rank.
@@ -124,14 +132,32 @@ class WindowPlan:
         ends = sorted(cuts)
         runs = list(itertools.pairwise(ends))
         self.groups = (Group * max(len(runs), 1))()
-        self.edge, self.updates = 0, 0
+        self.edge, self.updates, chunk = 0, 0, 0
         for i, (first, last) in enumerate(runs):
             count = int(disc.group[first])
-            self.groups[i] = Group(first, last, int(disc.region[first]), count, window / count)
+            step = window / count
+            self.groups[i] = Group(first, last, int(disc.region[first]), count, chunk, step)
+            chunk += -(-(last - first) // CHUNK)
             self.edge += first < disc.boundary_blocks
             self.updates += count * int(np.sum(disc.source_cell[first:last] >= 0))
         self.count = len(runs)
+        self._chunks(disc, np.array(runs, np.int64).reshape(-1, 2), chunk)
         self._events(disc, window)
+
+    def _chunks(self, disc: Discretisation, runs: Ints, chunks: int) -> None:
+        """Nodes by the first chunk of CHUNK blocks, within each group, whose cells touch them."""
+        blocks = np.arange(disc.blocks)
+        group = np.searchsorted(runs[:, 1], blocks, side="right")
+        first = np.array([self.groups[i].chunk for i in range(self.count)], np.int64)
+        chunk = first[group] + (blocks - runs[group, 0]) // CHUNK
+        nodes = disc.cells.reshape(disc.blocks, -1)
+        key, at = np.unique(group[:, None] * (disc.nodes + 1) + nodes, return_index=True)
+        node, chunk = key % (disc.nodes + 1), chunk[at // max(nodes.shape[1], 1)]
+        real = node < disc.nodes
+        order = np.argsort(chunk[real], kind="stable")
+        self.touched = np.ascontiguousarray(node[real][order], dtype=np.int32)
+        counts = np.bincount(chunk[real], minlength=chunks)
+        self.touched_from = np.concatenate([[0], np.cumsum(counts)])
 
     def _events(self, disc: Discretisation, window: float) -> None:
         rows: list[tuple[float, int, int]] = []

@@ -1,15 +1,17 @@
 /* SPDX-License-Identifier: LGPL-3.0-or-later
  * Replay of windows: events in order, boundaries of windows, references. Behind events.h and the
- * regions' event functions; needs EVENT(region, ...), without which
- * there is no replay. */
+ * regions' event functions; needs EVENT(region, ...), without which there is no replay. */
 
 #ifdef EVENT
+/* Chunk by chunk, nodes drift and cells kick: what drifts together is still in cache when kicked. */
 static void act(const world *s, const group *g, double t, double weight, int mode) {
-  if (g->last > g->first)
-    EVENT(g->region, g->last - g->first, g->first, s->cell + g->first * (DIM + 1) * W,
-          s->geometry + g->first * GEOMETRY * W, s->coefficient + g->first * COEFFICIENTS * W,
-          s->reference + g->first * REFERENCES * W, s->stress + g->first * REFERENCES * W, s, t,
-          weight, mode);
+  const int64_t *from = s->touched_from + g->chunk;
+  for (int64_t m = g->first; m < g->last; m += CHUNK, from++) {
+    const int64_t blocks = m + CHUNK < g->last ? CHUNK : g->last - m;
+    drift_all(s, s->touched + from[0], from[1] - from[0], t);
+    EVENT(g->region, blocks, m, s->cell + m * (DIM + 1) * W, s->geometry + m * GEOMETRY * W,
+          s->coefficient + m * COEFFICIENTS * W, s->reference + m * REFERENCES * W, s, weight, mode);
+  }
 }
 
 /* Events [first, last) of the window's list. */
@@ -20,8 +22,9 @@ void cb_replay(const world *s, const happening *list, int64_t first, int64_t las
   }
 }
 
-/* All cells of groups [first, last) at t with `part` of their steps as weight. */
+/* All cells of groups [first, last) at t with `part` of their steps as weight; keeps afresh. */
 void cb_together(const world *s, int64_t first, int64_t last, double t, double part, int mode) {
+  if (mode & KEEP) memset(s->stress, 0, (s->nodes + 1) * ROWS * W * sizeof(double));
   for (int64_t i = first; i < last; i++) act(s, s->groups + i, t, part * s->groups[i].step, mode);
 }
 #endif
@@ -49,38 +52,15 @@ void cb_apply(const world *s, double t, const int32_t *rows, int64_t count) {
 }
 
 #if BALANCED
-#define ROWS ((REFERENCES + W - 1) / W) /* vectors per node in [node][ROWS * W] */
-
-/* node[a] += sqrt|K| value over the cells: the numerator of a volume average. With `old`, value is
- * first carried to mid-window, stress + (stress - old)/2, and old becomes the stress. */
-void cb_to_nodes(const world *s, int64_t blocks, double *old, double *node) {
-  const int32_t *c = s->cell;
-  for (int64_t m = 0; m < blocks; m++, c += (DIM + 1) * W) {
-    const vec r = *(const vec *)(s->geometry + (m * GEOMETRY + DIM * DIM) * W);
-    vec *now = (vec *)(s->stress + m * REFERENCES * W), *before = (vec *)(old + m * REFERENCES * W);
-    const vec *held = (const vec *)(s->reference + m * REFERENCES * W);
-    for (int g = 0; g < ROWS; g++) {
-      vec row[W];
-      for (int i = 0; i < W; i++) {
-        const int j = g * W + i;
-        if (j >= REFERENCES) {
-          row[i] = (vec){0};
-        } else if (old) {
-          row[i] = r * (1.5 * now[j] - 0.5 * before[j]);
-          before[j] = now[j];
-        } else {
-          row[i] = r * held[j];
-        }
-      }
-      transpose(row);
-      for (int l = 0; l < W; l++)
-        for (int a = 0; a <= DIM; a++)
-          *(vec_u *)(node + (int64_t)c[a * W + l] * ROWS * W + g * W) += row[l];
-    }
+/* Kept stresses carried to mid-window, stress + (stress - old)/2, and old = stress. */
+void cb_carry(const world *s, double *restrict old, double *restrict node) {
+  for (int64_t i = 0; i < s->nodes * ROWS * W; i++) {
+    node[i] = 1.5 * s->stress[i] - 0.5 * old[i];
+    old[i] = s->stress[i];
   }
 }
 
-/* node /= (d + 1) volume: what cb_to_nodes added up becomes an average. */
+/* node /= (d + 1) volume: what cells added up becomes a volume average. */
 void cb_scale_nodes(const world *s, double *node) {
   for (int64_t a = 0; a < s->nodes; a++) {
     const double w = record_of(s, a)[INVERSE] / (DIM + 1.0);
@@ -88,12 +68,28 @@ void cb_scale_nodes(const world *s, double *node) {
   }
 }
 
-/* Back: reference = sqrt|K| times the mean over the cell's vertices. */
-void cb_to_cells(const world *s, int64_t blocks, const double *node) {
+/* out += volume times the mean over the cell's vertices: one pass of smoothing, not yet scaled. */
+void cb_smooth(const world *s, int64_t blocks, const double *in, double *out) {
   const int32_t *c = s->cell;
   for (int64_t m = 0; m < blocks; m++, c += (DIM + 1) * W) {
-    const vec r = *(const vec *)(s->geometry + (m * GEOMETRY + DIM * DIM) * W) / (DIM + 1.0);
-    vec *held = (vec *)(s->reference + m * REFERENCES * W);
+    const double *r = s->geometry + (m * GEOMETRY + DIM * DIM) * W;
+    for (int l = 0; l < W; l++)
+      for (int g = 0; g < ROWS * W; g += W) {
+        vec row = {0};
+        for (int a = 0; a <= DIM; a++) row += *(const vec_u *)(in + (int64_t)c[a * W + l] * ROWS * W + g);
+        row *= r[l] * r[l] / (DIM + 1.0);
+        for (int a = 0; a <= DIM; a++) *(vec_u *)(out + (int64_t)c[a * W + l] * ROWS * W + g) += row;
+      }
+  }
+}
+
+/* reference = sqrt|K| times the mean over the cell's vertices, and its nodal forces (partial),
+ * F_a -= s B_a + z r/(d+1): [node][NR]. */
+void cb_to_cells(const world *s, int64_t blocks, const double *node, double *force) {
+  const int32_t *c = s->cell;
+  for (int64_t m = 0; m < blocks; m++, c += (DIM + 1) * W) {
+    const vec *b = (const vec *)(s->geometry + m * GEOMETRY * W), r = b[DIM * DIM] / (DIM + 1.0);
+    vec *t = (vec *)(s->reference + m * REFERENCES * W);
     for (int g = 0; g < ROWS; g++) {
       vec row[W];
       for (int l = 0; l < W; l++) {
@@ -102,8 +98,20 @@ void cb_to_cells(const world *s, int64_t blocks, const double *node) {
           row[l] += *(const vec_u *)(node + (int64_t)c[a * W + l] * ROWS * W + g * W);
       }
       transpose(row);
-      for (int i = 0; i < W && g * W + i < REFERENCES; i++) held[g * W + i] = r * row[i];
+      for (int i = 0; i < W && g * W + i < REFERENCES; i++) t[g * W + i] = r * row[i];
     }
+    vec f[DIM + 1][NR] = {{{0}}};
+    for (int i = 0; i < N; i++) {
+      const vec z = REFERENCES > STRESSES ? t[STRESSES + i] * r : (vec){0};
+      for (int a = 1; a <= DIM; a++) {
+        vec y = {0};
+        for (int j = 0; j < DIM; j++) y += t[slot[i * DIM + j]] * b[(a - 1) * DIM + j];
+        f[a][i] = -y - z;
+        f[0][i] += y;
+      }
+      f[0][i] -= z;
+    }
+    for (int a = 0; a <= DIM; a++) scatter(force, c + a * W, f[a]);
   }
 }
 
@@ -113,28 +121,6 @@ void cb_accelerate(const world *s, const double *force) {
     double *r = record_of(s, a);
     for (int i = 0; i < N; i++) r[2 * NR + i] = 0;
     impulse(s, a, force + a * NR, r[INVERSE], r + 2 * NR);
-  }
-}
-
-/* Nodal forces of the reference stress (partial), F_a -= s B_a + z r/(d+1): [node][NR]. */
-void cb_reference_force(const world *s, int64_t blocks, double *force) {
-  const int32_t *c = s->cell;
-  for (int64_t m = 0; m < blocks; m++, c += (DIM + 1) * W) {
-    const vec *b = (const vec *)(s->geometry + m * GEOMETRY * W);
-    const vec *t = (const vec *)(s->reference + m * REFERENCES * W);
-    const vec r = b[DIM * DIM] / (DIM + 1.0);
-    vec f[DIM + 1][NR] = {{{0}}};
-    for (int i = 0; i < N; i++) {
-      const vec z = REFERENCES > N * DIM ? t[N * DIM + i] * r : (vec){0};
-      for (int a = 1; a <= DIM; a++) {
-        vec y = {0};
-        for (int j = 0; j < DIM; j++) y += t[i * DIM + j] * b[(a - 1) * DIM + j];
-        f[a][i] = -y - z;
-        f[0][i] += y;
-      }
-      f[0][i] -= z;
-    }
-    for (int a = 0; a <= DIM; a++) scatter(force, c + a * W, f[a]);
   }
 }
 

@@ -2,240 +2,21 @@
  * Asynchronous events: W cells act once at a common time, each with its own step as weight.
  *
  * At an event of cell K at t (paper (Discr-dAL1), (Discr-dAL2)): its nodes drift to t, the force is
- * taken there, and each node is kicked by h_K f. A node's record holds everything a drift needs:
- *   [ position (NR) | rate (NR) | acceleration (NR, only with a reference force) | time, 1/volume ]
- * time and 1/volume sit in the padding of position where there is room (TIME, INVERSE).
- * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, REFERENCES, BALANCED, DAMPED,
- * SCHEME, SLOW. Unless SLOW, inertia is diagonal and the components of nu share one rate. */
+ * taken there, and each node is kicked by h_K f. Behind drifts.h. */
 
-#define VN (NR < 8 ? NR : 8)
-typedef double nvec __attribute__((vector_size(8 * VN), aligned(8)));
-#define PARTS (2 + BALANCED)
-#if NR - N >= 2
-#define RECORD (PARTS * NR)
-#define TIME N
-#define INVERSE (N + 1)
-#else
-#define RECORD (PARTS * NR + 2)
-#define TIME (PARTS * NR)
-#define INVERSE (PARTS * NR + 1)
-#endif
-
-typedef struct { int64_t first, last, region, divisions; double step; } group; /* blocks, N_K, h_K */
-typedef struct { double time; int64_t group; } happening; /* a group acts, time within the window */
-
-typedef struct {
-  int64_t nodes, late, beyond; /* kicks of nodes [late, beyond) are collected for the exchange */
-  double *record;             /* [node][RECORD] */
-  const int32_t *klass;       /* class of a node, or NULL */
-  const double *inverse_mass; /* [class][NR]: 0 where prescribed; 1 where there is no inertia */
-  const double *rate;         /* [class][NR]: eta / inertia */
-  const double *compliance;   /* [class][NR]: 1 / eta where there is no inertia, else 0 */
-  const double *eta;          /* [class][NR]: damping per volume */
-  const double *basis, *inverse_basis; /* [class][N][N]: V, in which all these are diagonal */
-  double *collected;          /* [shared nodes][NR] */
-  const group *groups;
-  const int32_t *cell;
-  const double *geometry, *coefficient;
-  double *reference, *stress; /* [block][REFERENCES][lane] */
-  double *sums;               /* dissipated work */
-  const uint8_t *counted;
-  const double *coordinates;  /* [node][3], and for tabulated regions [region]{force, stress}: */
-  const tabulated *forms;
-  double start;               /* of the window */
-} world;
-
-INLINE double *record_of(const world *s, int64_t a) { return s->record + a * RECORD; }
-
-/* Drifts. With rate z = eta dt / inertia, a constant acceleration a (0 unless BALANCED), and a mean
- * rate over dt, x += dt mean, where for the schemes 0 exact, 1 symmetric, 2 forward
- *   mean = c1 v + c2 a,  v <- c3 v + c4 a,
- * exact: the flow of x'' + (eta/inertia) x' = a, with p1 = (1 - e^-z)/z and p2 = (1 - p1)/z. */
-
-INLINE vec choose(ivec mask, vec yes, vec no) {
-  return (vec)(((ivec)yes & mask) | ((ivec)no & ~mask));
+/* Drift distinct nodes to t. */
+INLINE void drift_all(const world *s, const int32_t *nodes, int64_t count, double t) {
+  int64_t i = 0;
+  for (; i + W <= count; i += W) drift(s, nodes + i, (vec){0} + t);
+  if (i < count) {
+    int32_t rest[W];
+    for (int l = 0; l < W; l++) rest[l] = nodes[i + l < count ? i + l : count - 1];
+    drift(s, rest, (vec){0} + t);
+  }
 }
 
-/* (1 - e^-z)/z for z >= 0, to round-off: a series below 1/2, else e^-z by range reduction. */
-INLINE vec phi1(vec z) {
-  const vec y = choose(z < 0.5, z, (vec){0} + 0.25);
-  vec series = (vec){0} + 1.0 / 1307674368000.0;
-  static const double c[] = {1.0 / 87178291200.0, 1.0 / 6227020800.0, 1.0 / 479001600.0,
-                             1.0 / 39916800.0, 1.0 / 3628800.0, 1.0 / 362880.0, 1.0 / 40320.0,
-                             1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5, 1.0};
-  for (int i = 0; i < 14; i++) series = c[i] - y * series;
-  if (__builtin_expect(1, 1)) {
-    int large = 0;
-    for (int l = 0; l < W; l++) large |= z[l] >= 0.5;
-    if (!large) return series;
-  }
-  vec direct;
-  for (int l = 0; l < W; l++) direct[l] = z[l] >= 0.5 ? -expm1(-z[l]) / z[l] : 1.0;
-  return choose(z < 0.5, series, direct);
-}
-
-/* (1 - p1)/z, by its own series where the difference cancels. */
-INLINE vec phi2(vec z, vec p1) {
-  const ivec small = z < 0.1;
-  const vec y = choose(small, z, (vec){0} + 0.1);
-  vec series = (vec){0} + 1.0 / 479001600.0;
-  static const double c[] = {1.0 / 39916800.0, 1.0 / 3628800.0, 1.0 / 362880.0, 1.0 / 40320.0,
-                             1.0 / 5040.0, 1.0 / 720.0, 1.0 / 120.0, 1.0 / 24.0, 1.0 / 6.0, 0.5};
-  for (int i = 0; i < 10; i++) series = c[i] - y * series;
-  return choose(small, series, (1.0 - p1) / choose(small, (vec){0} + 1.0, z));
-}
-
-typedef struct { vec dt, c1, c2, c3, c4; } drifting;
-
-INLINE drifting coefficients(vec dt, vec z) {
-  drifting d;
-  d.dt = dt;
-#if SCHEME == 0
-  d.c1 = phi1(z);
-  d.c2 = dt * phi2(z, d.c1);
-  d.c3 = 1.0 - z * d.c1;
-  d.c4 = dt * d.c1;
-#elif SCHEME == 1
-  d.c1 = 1.0 / (1.0 + 0.5 * z);
-  d.c2 = 0.5 * dt * d.c1;
-  d.c3 = 2.0 * d.c1 - 1.0;
-  d.c4 = 2.0 * d.c2;
-#else
-  d.c1 = 1.0 / (1.0 + z);
-  d.c2 = dt * choose(z > 0.0, d.c1, (vec){0} + 0.5); /* undamped nodes move along parabolas */
-  d.c3 = d.c1;
-  d.c4 = dt * d.c1;
-#endif
-  return d;
-}
-
-#if SLOW
-/* In a class's basis V (VT M V and VT D V diagonal) rates y stand for v = V y; component by
- * component, since they may differ in eta/inertia. Those without inertia (y is then momentum per
- * volume) spend it at once. */
-INLINE void drift_slowly(const world *s, int64_t a, double dt) {
-  double *r = record_of(s, a), lost = 0, mean[N];
-  const int64_t k = s->klass ? s->klass[a] : 0;
-  const double *V = s->basis + k * N * N;
-  if (dt == 0) return;
-  for (int i = 0; i < N; i++) {
-    const double soft = s->compliance[k * NR + i], force = BALANCED ? r[2 * NR + i] : 0.0;
-    const vec zero = {0}, z = zero + s->rate[k * NR + i] * dt;
-    double *v = r + NR + i;
-    if (soft != 0) {
-      mean[i] = soft * (*v / dt + force);
-      *v = 0;
-    } else if (z[0] == 0) {
-      mean[i] = *v + 0.5 * dt * force;
-      *v += dt * force;
-    } else {
-      const drifting d = coefficients(zero + dt, z);
-      mean[i] = d.c1[0] * *v + d.c2[0] * force;
-      *v = d.c3[0] * *v + d.c4[0] * force;
-    }
-    lost += s->eta[k * NR + i] * mean[i] * mean[i];
-  }
-  for (int i = 0; i < N; i++) {
-    double sum = 0;
-    for (int j = 0; j < N; j++) sum += V[i * N + j] * mean[j];
-    r[i] += dt * sum;
-  }
-  if (s->counted[a]) s->sums[0] += dt * lost / r[INVERSE];
-}
-#endif
-
-/* Change of a node's rates by an impulse per volume: y += m^-1 VT impulse. */
-INLINE void impulse(const world *s, int64_t a, const double *f, double weight, double *y) {
-  const int64_t k = s->klass ? s->klass[a] : 0;
-  const double *m = s->inverse_mass + k * NR;
-#if SLOW
-  const double *V = s->basis + k * N * N;
-  for (int i = 0; i < N; i++) {
-    double sum = 0;
-    for (int j = 0; j < N; j++) sum += V[j * N + i] * f[j];
-    y[i] += weight * m[i] * sum;
-  }
-#else
-  for (int i = 0; i < N; i++) y[i] += weight * m[i] * f[i];
-#endif
-}
-
-/* Position with its time set, where time sits in the padding: a scalar store there would stall the
- * vector loads that follow. */
-INLINE nvec timed(nvec x, int g, double t) {
-  if (TIME < NR && TIME / VN == g) x[TIME % VN] = t;
-  return x;
-}
-
-/* Drift W nodes (which may repeat), each to its own t. */
-INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
-#if SLOW
-  for (int l = 0; l < W; l++) {
-    double *r = record_of(s, nodes[l]);
-    drift_slowly(s, nodes[l], t[l] - r[TIME]);
-    r[TIME] = t[l];
-  }
-#elif DAMPED
-  vec dt, z, volume;
-  for (int l = 0; l < W; l++) {
-    const double *r = record_of(s, nodes[l]);
-    dt[l] = t[l] - r[TIME];
-    z[l] = s->rate[(s->klass ? s->klass[nodes[l]] : 0) * NR + NU];
-    volume[l] = s->counted[nodes[l]] ? r[INVERSE] : INFINITY;
-  }
-  const drifting d = coefficients(dt, z * dt);
-  double c[5][W], weight[W];
-  memcpy(c, &d, sizeof c);
-  volume = dt / volume;
-  memcpy(weight, &volume, sizeof weight);
-  nvec nu[NR / VN], lost[NR / VN];
-  for (int i = 0; i < NR; i++) nu[i / VN][i % VN] = i >= NU && i < N;
-  memset(lost, 0, sizeof lost);
-  for (int l = 0; l < W; l++) {
-    double *r = record_of(s, nodes[l]);
-    if (r[TIME] == t[l]) continue; /* at rest in time, or a node that comes again */
-    nvec *x = (nvec *)r, *v = (nvec *)(r + NR);
-    const nvec *eta = (const nvec *)(s->eta + (s->klass ? s->klass[nodes[l]] : 0) * NR);
-    for (int g = 0; g < NR / VN; g++) {
-#if BALANCED
-      const nvec a = ((nvec *)(r + 2 * NR))[g];
-      const nvec mean = v[g] + 0.5 * c[0][l] * a +
-                        nu[g] * ((c[1][l] - 1.0) * v[g] + (c[2][l] - 0.5 * c[0][l]) * a);
-      v[g] += c[0][l] * a + nu[g] * ((c[3][l] - 1.0) * v[g] + (c[4][l] - c[0][l]) * a);
-#else
-      const nvec mean = v[g] + nu[g] * ((c[1][l] - 1.0) * v[g]);
-      v[g] += nu[g] * ((c[3][l] - 1.0) * v[g]);
-#endif
-      x[g] = timed(x[g] + c[0][l] * mean, g, t[l]);
-      lost[g] += weight[l] * eta[g] * mean * mean;
-    }
-    if (TIME >= NR) r[TIME] = t[l];
-  }
-  double sum = 0;
-  for (int i = 0; i < NR; i++) sum += lost[i / VN][i % VN];
-  s->sums[0] += sum;
-#else
-  for (int l = 0; l < W; l++) {
-    double *r = record_of(s, nodes[l]);
-    const double dt = t[l] - r[TIME];
-    nvec *x = (nvec *)r, *v = (nvec *)(r + NR);
-    for (int g = 0; g < NR / VN; g++) {
-#if BALANCED
-      const nvec a = ((nvec *)(r + 2 * NR))[g];
-      x[g] = timed(x[g] + dt * (v[g] + (0.5 * dt) * a), g, t[l]);
-      v[g] += dt * a;
-#else
-      x[g] = timed(x[g] + dt * v[g], g, t[l]);
-#endif
-    }
-    if (TIME >= NR) r[TIME] = t[l];
-  }
-#endif
-}
-
-/* Drift the nodes of W cells, each to its own t, and hand out their positions, one component per vector. */
-INLINE void drift_gather(const world *s, const int32_t *c, const vec t, vec out[NR]) {
-  drift(s, c, t);
+/* Positions of the nodes of W cells, one component per vector. */
+INLINE void gather_records(const world *s, const int32_t *c, vec out[NR]) {
 #if NR >= W
   for (int g = 0; g < NR; g += W) {
     vec r[W];
@@ -243,38 +24,75 @@ INLINE void drift_gather(const world *s, const int32_t *c, const vec t, vec out[
     transpose(r);
     for (int i = 0; i < W; i++) out[g + i] = r[i];
   }
+#elif NR == 4
+  vec r[4];
+  for (int l = 0; l < 4; l++) {
+    const half a = *(const half *)record_of(s, c[l]), b = *(const half *)record_of(s, c[l + 4]);
+    r[l] = (vec){a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]};
+  }
+  transpose4(r);
+  for (int i = 0; i < 4; i++) out[i] = r[i];
 #else
   for (int l = 0; l < W; l++)
     for (int i = 0; i < N; i++) out[i][l] = record_of(s, c[l])[i];
 #endif
 }
 
+/* Drift the nodes of W cells, each to its own t, and hand out their positions. */
+INLINE void drift_gather(const world *s, const int32_t *c, const vec t, vec out[NR]) {
+  drift(s, c, t);
+  gather_records(s, c, out);
+}
+
+/* Ask for what a later block will read: groups are runs too short for the processor to foresee. */
+INLINE void ahead(const vec *p, int size) {
+  for (int i = 0; i < size; i++) __builtin_prefetch(p + 8 * size + i, 0, 2);
+}
+
+/* True if some of W nodes are shared and collect. */
+INLINE int collects(const world *s, const int32_t *c) {
+  if (s->late == s->beyond) return 0;
+  const uint32_t late = (uint32_t)s->late, shared = (uint32_t)(s->beyond - s->late);
+  int any = 0;
+  for (int l = 0; l < W; l++) any |= (uint32_t)c[l] - late < shared;
+  return any;
+}
+
 /* Kick the nodes of W cells: rate += weight f / (volume m); shared nodes collect. */
 INLINE void kick(const world *s, const int32_t *c, const vec weight, const vec in[NR]) {
-#if NR >= W && !SLOW
+  if (collects(s, c) || SLOW || (NR < W && NR != 4)) {
+    for (int l = 0; l < W; l++) {
+      const int64_t a = c[l];
+      double *r = record_of(s, a), f[N];
+      for (int i = 0; i < N; i++) f[i] = in[i][l];
+      if (a >= s->late && a < s->beyond)
+        for (int i = 0; i < N; i++) s->collected[(a - s->late) * NR + i] += weight[l] * f[i];
+      else
+        impulse(s, a, f, weight[l] * r[INVERSE], r + NR);
+    }
+    return;
+  }
+#if !SLOW && NR >= W
   for (int g = 0; g < NR; g += W) {
     vec f[W];
     for (int i = 0; i < W; i++) f[i] = weight * in[g + i];
     transpose(f);
     for (int l = 0; l < W; l++) {
-      const int64_t a = c[l];
-      double *r = record_of(s, a);
-      const vec m = *(const vec_u *)(s->inverse_mass + (s->klass ? s->klass[a] : 0) * NR + g);
-      const int collect = a >= s->late && a < s->beyond;
-      vec_u *to = (vec_u *)(collect ? s->collected + (a - s->late) * NR + g : r + NR + g);
-      *to += collect ? f[l] : r[INVERSE] * m * f[l];
+      double *r = record_of(s, c[l]);
+      const double *m = s->inverse_mass + (s->klass ? s->klass[c[l]] : 0) * NR + g;
+      *(vec_u *)(r + NR + g) += r[INVERSE] * *(const vec_u *)m * f[l];
     }
   }
-#else
+#elif !SLOW && NR == 4
+  vec f[4];
+  for (int i = 0; i < 4; i++) f[i] = weight * in[i];
+  transpose4(f);
   for (int l = 0; l < W; l++) {
-    const int64_t a = c[l];
-    double *r = record_of(s, a), f[N];
-    const int collect = a >= s->late && a < s->beyond;
-    for (int i = 0; i < N; i++) f[i] = in[i][l];
-    if (collect)
-      for (int i = 0; i < N; i++) s->collected[(a - s->late) * NR + i] += weight[l] * f[i];
-    else
-      impulse(s, a, f, weight[l] * r[INVERSE], r + NR);
+    const vec p = f[l % 4];
+    const nvec q = l < 4 ? (nvec){p[0], p[1], p[2], p[3]} : (nvec){p[4], p[5], p[6], p[7]};
+    double *r = record_of(s, c[l]);
+    const double *m = s->inverse_mass + (s->klass ? s->klass[c[l]] : 0) * NR;
+    *(nvec *)(r + NR) += r[INVERSE] * *(const nvec *)m * q;
   }
 #endif
 }
@@ -282,19 +100,37 @@ INLINE void kick(const world *s, const int32_t *c, const vec weight, const vec i
 /* What a block does besides kicking: keep its stress, or act against the reference. */
 enum { KEEP = 1, AGAINST = 2 };
 
+/* Where the stress of a component along an axis stands among the references. */
+#if REFERENCES
+static const int slot[N * DIM] = PLACES;
+
+/* Leave stresses (times r, the root of the volume) behind: node += r stress, once per window. */
+__attribute__((unused, noinline)) static void keep(const world *s, const int32_t *c, vec r,
+                                                   const vec *stress) {
+  for (int g = 0; g < ROWS; g++) {
+    vec row[W];
+    for (int i = 0; i < W; i++)
+      row[i] = g * W + i < REFERENCES ? r * stress[g * W + i] : (vec){0};
+    transpose(row);
+    for (int l = 0; l < W; l++)
+      for (int a = 0; a <= DIM; a++)
+        *(vec_u *)(s->stress + (int64_t)c[a * W + l] * ROWS * W + g * W) += row[l];
+  }
+}
+#endif
+
 /* An event of cells whose density is not quadratic: forces and mean stresses by FFCx. */
 __attribute__((unused)) static void tabulated_event(
     const tabulated *force, const tabulated *stress, int64_t blocks, int64_t first, const int32_t *c,
-    const double *geometry, const double *held, double *kept, const world *s, double t,
-    double weight, int mode) {
+    const double *geometry, const double *held, const world *s, double weight, int mode) {
   const int zero = 0; const uint8_t none = 0;
   double w[force->before + force->after + stress->before + stress->after + LOCAL + 1];
   double at[3 * (DIM + 1)], out[LOCAL], mean[REFERENCES + 1];
   for (int64_t m = 0; m < blocks; m++, c += (DIM + 1) * W) {
     const vec *b = (const vec *)(geometry + m * GEOMETRY * W);
-    vec f[DIM + 1][NR];
+    vec f[DIM + 1][NR], left[ROWS * W + 1];
     memset(f, 0, sizeof f);
-    for (int a = 0; a <= DIM; a++) drift(s, c + a * W, (vec){0} + t);
+    memset(left, 0, sizeof left);
     for (int l = 0; l < W && c[l] < s->nodes; l++) {
       if (force->function) {
         tabulated_input(force, first + m, l, c, s->record, RECORD, s->coordinates, w, at);
@@ -308,22 +144,25 @@ __attribute__((unused)) static void tabulated_event(
         memset(mean, 0, sizeof mean);
         stress->function(mean, w, stress->constants, at, &zero, &none, 0);
         for (int i = 0; i < REFERENCES; i++) /* the mean times sqrt|K| */
-          kept[(m * REFERENCES + i) * W + l] = mean[i] / b[DIM * DIM][l];
+          left[i][l] = mean[i] / b[DIM * DIM][l];
       }
     }
+#if REFERENCES
+    if (mode & KEEP) keep(s, c, b[DIM * DIM], left);
     if (mode & AGAINST) {
       const vec *r = (const vec *)(held + m * REFERENCES * W);
-      for (int i = 0; i < N && REFERENCES; i++) {
-        const vec z = REFERENCES > N * DIM ? r[N * DIM + i] * b[DIM * DIM] / (DIM + 1.0) : (vec){0};
+      for (int i = 0; i < N; i++) {
+        const vec z = REFERENCES > STRESSES ? r[STRESSES + i] * b[DIM * DIM] / (DIM + 1.0) : (vec){0};
         for (int a = 1; a <= DIM; a++) {
           vec y = {0};
-          for (int j = 0; j < DIM; j++) y += r[i * DIM + j] * b[(a - 1) * DIM + j];
+          for (int j = 0; j < DIM; j++) y += r[slot[i * DIM + j]] * b[(a - 1) * DIM + j];
           f[a][i] += y + z;
           f[0][i] -= y;
         }
         f[0][i] += z;
       }
     }
+#endif
     for (int a = 0; a <= DIM; a++) kick(s, c + a * W, (vec){0} + weight, f[a]);
   }
 }

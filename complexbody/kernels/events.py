@@ -7,36 +7,50 @@ import ctypes
 from typing import TYPE_CHECKING
 
 from complexbody import native
+from complexbody.kernels.event_source import EventSource
 from complexbody.kernels.ffcx import Tabulated, TabulatedRecord
 from complexbody.kernels.library import Kernels
-from complexbody.kernels.quadratic import RegionSource
 from complexbody.masses import SCHEMES
 
 if TYPE_CHECKING:
     from complexbody.integrators.asynchronous import AVI
 
+#: Blocks of cells whose nodes drift together before the cells act: less than an L1 cache full.
+CHUNK = 8
 
-def regions(kernels: Kernels) -> list[RegionSource | None]:
+
+def regions(kernels: Kernels) -> list[EventSource | None]:
     """Source generators of the regions with generated code; None for the others."""
     d, disc, scene = kernels.densities, kernels.disc, kernels.action.scene
     lumped = scene.self_action == "lumped"
-    out: list[RegionSource | None] = []
+    out: list[EventSource | None] = []
     for r, generated in enumerate(d.generated):
         stored = d.stored[r]
         if not generated or stored is None:
             out.append(None)
             continue
-        out.append(
-            RegionSource(r, stored, d.potential[r], disc.n, disc.dim, lumped, d.coefficients)
-        )
+        out.append(EventSource(r, stored, d.potential[r], disc.n, disc.dim, lumped, d.coefficients))
     return out
 
 
+def has_values(kernels: Kernels) -> bool:
+    """True if a region may have self-actions, and the reference thus holds n of them."""
+    return any(region is None or region.has_values for region in regions(kernels))
+
+
+def slots(kernels: Kernels) -> list[int]:
+    """Place of each of the n·d stresses in the reference: those equal in all regions share it."""
+    disc, found = kernels.disc, regions(kernels)
+    if any(region is None for region in found):
+        return list(range(disc.n * disc.dim))
+    rows = list(zip(*(region.stress_rows() for region in found if region), strict=True))
+    distinct = list(dict.fromkeys(rows))
+    return [distinct.index(row) for row in rows]
+
+
 def references(kernels: Kernels) -> int:
-    """Reference values per cell: n·d stresses, and n self-actions if a region may have them."""
-    disc = kernels.disc
-    values = any(region is None or region.has_values for region in regions(kernels))
-    return disc.n * disc.dim + (disc.n if values else 0)
+    """Reference values per cell: distinct stresses, and n self-actions if a region may have any."""
+    return max(slots(kernels)) + 1 + (kernels.disc.n if has_values(kernels) else 0)
 
 
 class Forms:
@@ -46,7 +60,7 @@ class Forms:
         disc, action = kernels.disc, kernels.action
         self.records = (TabulatedRecord * (2 * len(action.scene.bodies)))()
         self._keep = []
-        values = references(kernels) > disc.n * disc.dim
+        values = has_values(kernels)
         for r, body in enumerate(action.scene.bodies):
             if kernels.densities.generated[r]:
                 continue
@@ -64,7 +78,7 @@ def record_size(components: int, record: int, balanced: bool) -> tuple[int, int,
     parts = 3 if balanced else 2
     if record - components >= 2:
         return parts * record, components, components + 1
-    return parts * record + 2, parts * record, parts * record + 1
+    return (parts + (2 if record < 2 else 1)) * record, parts * record, parts * record + 1
 
 
 def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL:
@@ -77,7 +91,8 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
         slow: Components of ν differ in η/ρ̄, lack inertia, or are coupled by Ω or η.
     """
     disc, scene = kernels.disc, kernels.action.scene
-    count = references(kernels) if method.balanced else 0
+    place = slots(kernels) if method.balanced else []
+    count, values = (references(kernels) if method.balanced else 0), has_values(kernels)
     exact = method.schedule == "exact"
     coefficients = len(kernels.densities.coefficients)
     defines = {
@@ -86,9 +101,12 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
         "REFERENCES": count, "BALANCED": int(method.balanced), "DAMPED": int(damped),
         "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
         "CORRECTED": int(method.corrected), "PACKED": packed_size(kernels),
+        "CHUNK": CHUNK, "STRESSES": max(place, default=-1) + 1,
+        "PLACES": "{" + ", ".join(map(str, place)) + "}",
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
-    parts += [native.template(name) for name in ("vectors.h", "tabulated.h", "events.h")]
+    files = ("vectors.h", "tabulated.h", "drifts.h", "events.h")
+    parts += [native.template(name) for name in files]
     if exact:
         parts.append(native.template("lone.h"))
     cases = ""
@@ -101,13 +119,13 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
                 parts.append(region.lone(bool(method.corrected)))
                 call = f"lone_{r}(s, c, b, k, t, soft, out)"
         elif region is not None:
-            parts.append(region.event(count))
-            call = f"event_{r}(blocks, c, g, k, held, kept, s, t, w, mode)"
+            parts.append(region.event(place, values))
+            call = f"event_{r}(blocks, c, g, k, held, s, w, mode)"
         else:
-            arguments = f"{forms}, {forms} + 1, blocks, first, c, g, held, kept, s, t, w, mode"
+            arguments = f"{forms}, {forms} + 1, blocks, first, c, g, held, s, w, mode"
             call = f"tabulated_event({arguments})"
         cases += f"case {r}: {call}; break; "
-    head = "EVENT(region, blocks, first, c, g, k, held, kept, s, t, w, mode)"
+    head = "EVENT(region, blocks, first, c, g, k, held, s, w, mode)"
     if exact:
         head = "LONE(region, s, c, cell, b, k, t, soft, count, out)"
     parts += [f"#define {head} switch (region) {{ {cases}}}", native.template("events.c")]

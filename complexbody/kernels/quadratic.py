@@ -21,7 +21,8 @@ from complexbody.hessian import Quadratic
 Entry = Any  # a float, or the name of a vector of cell-wise coefficients
 
 
-def _text(entry: Entry) -> str:
+def entry_text(entry: Entry) -> str:
+    """An entry in C."""
     return repr(entry) if isinstance(entry, float) else str(entry)
 
 
@@ -64,7 +65,7 @@ def straight_line(
             lines.append(f"const vec {tag}{number} = {text};")
             text = f"{tag}{number}"
         for row, entry in pattern:
-            terms[row].append(text if entry == 1.0 else f"{_text(entry)} * {text}")
+            terms[row].append(text if entry == 1.0 else f"{entry_text(entry)} * {text}")
     seen: dict[str, str] = {}
     for row, output in zip(rows, outputs, strict=True):
         value = " + ".join(terms[row]) or "(vec){0}"
@@ -127,7 +128,7 @@ class RegionSource:
             return b
         if isinstance(a, float) and isinstance(b, float):
             return a + b
-        return f"({_text(a)} + {_text(b)})"
+        return f"({entry_text(a)} + {entry_text(b)})"
 
     @property
     def needs_volume(self) -> bool:
@@ -177,63 +178,15 @@ class RegionSource:
             ],
         )
 
-    def event(self, references: int) -> str:
-        """Source of ``event_r``: drift to t, force there (against the reference), kick.
-
-        Args:
-            references: Reference values per cell: n·d stresses and, if there are values, n of z.
-        """
-        d, n, nodes = self.dim, self.n, range(self.dim + 1)
-        drifted = ["const vec at = (vec){0} + t, part = (vec){0} + weight;"]
-        drifted += self._gradient_lines("drift_gather(s, c + a * W, at, q[a])")
-        stresses = [f"stress[{i}] = s_[{i}];" for i in range(n * d)]
-        against = [f"s_[{i}] -= reference[{i}];" for i in range(n * d)]
-        if references > n * d:
-            stresses += [f"stress[{n * d + i}] = z[{i}];" for i in range(n)]
-            against += [f"p[{i}] -= reference[{n * d + i}] * r / {d + 1}.0;" for i in range(n)]
-        between = [
-            f"vec *stress = (vec *)(kept + m * {references} * W); (void)stress;",
-            f"const vec *reference = (const vec *)(held + m * {references} * W); (void)reference;",
-            f"if (mode & KEEP) {{ {' '.join(stresses)} }}" if references else "",
-            f"if (mode & AGAINST) {{ {' '.join(against)} }}" if references else "",
-        ]
-        return self._loop(
-            f"static void event_{self.number}(int64_t blocks, const int32_t *restrict c, "
-            "const double *restrict geometry, const double *restrict coefficient, "
-            "const double *restrict held, double *restrict kept, const world *s, double t, "
-            "double weight, int mode)",
-            [
-                *drifted,
-                *self._force_lines(between, with_values=references > n * d),
-                *(f"kick(s, c + {a} * W, part, f{a});" for a in nodes),
-            ],
-        )
-
-    def lone(self, corrected: bool) -> str:
-        """Source of ``lone_r``: W cells that share no node, each drifted to its own t: forces there.
-
-        Args:
-            corrected: Take the force at q + (h²/12) M⁻¹f(q), M the nodes' masses, ``soft`` = h²/12:
-                to leading order that of the softer potential V_K − (h²/24) ∇V_K·M⁻¹∇V_K.
-        """
-        first, *gradients = self._gradient_lines("drift_gather(s, c + a * W, t, q[a])")
-        forces, nodes = [*gradients, *self._force_lines([])], range(self.dim + 1)
-        soften = [f"soften(s, c + {a} * W, soft, f{a}, q[{a}]);" for a in nodes]
-        give = [f"memcpy(out[{a}], f{a}, sizeof f{a});" for a in nodes]
-        body = [first, *(["{", *forces, *soften, "}"] if corrected else []), *forces, *give]
-        return (
-            f"static void lone_{self.number}(const world *s, const int32_t *restrict c, "
-            "const vec *restrict b, const vec *restrict k, const vec t, const vec soft, "
-            "vec out[DIM + 1][NR]) {\n  (void)b, (void)k, (void)soft;\n  "
-            + "\n  ".join(body) + "\n}\n"
-        )  # fmt: skip
-
-    def _force_lines(self, between: list[str], with_values: bool = False) -> list[str]:
+    def _force_lines(
+        self, between: list[str], with_values: bool = False, weight: str = ""
+    ) -> list[str]:
         """Statements from gradients g, positions q to nodal forces f0 … fd.
 
         Args:
             between: Statements between stresses (s_, and the mean self-action z) and forces.
             with_values: Provide z = √|K| (H_vG G + H_vv mean), for ``between``.
+            weight: A factor of forces that come of values alone, in C.
         """
         d, n = self.dim, self.n
         grads, vals = self.gradients, self.values
@@ -271,7 +224,7 @@ class RegionSource:
                 body.append(f"f{a}[{i}] = -y{a}_{i}{f' - p[{i}]' if own else ''};")
         if vv:
             factor = f"{d + 1}.0" if self.lumped else f"{(d + 1) * (d + 2)}.0"
-            body.append(f"const vec w = r * r / {factor};")
+            body.append(f"const vec w = {weight}r * r / {factor};")
             present = sorted({row - 3 * n for row, _ in vv})
             for a in range(d + 1):
                 at = [f"q[{a}][{i}]" if self.lumped else f"(q[{a}][{i}] + t{i})" for i in range(n)]
@@ -308,12 +261,12 @@ class RegionSource:
                         f"e += 0.5 * r * r / {factor} * c{a}_{i} * {inputs[i]};" for i in range(n)
                     ]
             body += [
-                f"e += r * {_text(v)} * {names[order.index(i)]};"
+                f"e += r * {entry_text(v)} * {names[order.index(i)]};"
                 for i, v in linear.items()
                 if i in order
             ]
             if constant != 0.0:
-                body.append(f"e += r * r * {_text(constant)};")
+                body.append(f"e += r * r * {entry_text(constant)};")
             body.append(f"for (int l = 0; l < W; l++) out[{number}] += e[l]; }}")
         return self._loop(
             f"static void energy_{self.number}(int64_t blocks, const int32_t *restrict c, "
