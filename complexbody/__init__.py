@@ -11,6 +11,7 @@ from complexbody.body import Body
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
@@ -25,6 +26,7 @@ __all__ = [
     "ComplexBodyError",
     "Fix",
     "Initial",
+    "LocalLeapfrog",
     "Output",
     "Pressure",
     "Result",

@@ -26,6 +26,7 @@ from complexbody import machine, precheck, report
 from complexbody.errors import CommandError, MissingPackage
 from complexbody.files import on_first_rank
 from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
 from complexbody.output import NODE_FIELDS, Output, Probes
@@ -37,10 +38,10 @@ from complexbody.simulate import Result, Simulation, default_ledger_steps
 from complexbody.together import Interrupted, say, together
 
 #: Integrators by the name that --integrator takes; the first is the default.
-INTEGRATORS = {"synchronous": Synchronous, "avi": AVI}
+INTEGRATORS = {"synchronous": Synchronous, "avi": AVI, "local-leapfrog": LocalLeapfrog}
 _OPTIONS = (
     "step", "safety", "dissipation", "start", "critical", "unstable_ok", "balanced",
-    "passes", "filter",
+    "passes", "filter", "stabilisation", "levels",
 )  # fmt: skip
 
 
@@ -278,9 +279,10 @@ def check(a: argparse.Namespace, ranks: Any) -> None:
         prepared = job.method.prepare(problem, until)
         per_row = precheck.seconds_per_row(Bookkeeper(problem, prepared), comm)
         per_step = precheck.seconds_per_step(prepared, comm)
+        prepared.close()
         problem.close()
     say(ranks, report.memory(problem.kernels.bytes_per_cell(), cells))
-    say(ranks, report.step(prepared.step, prepared.critical, job.until))
+    say(ranks, report.step(prepared, job.method, job.until))
     rate = cells / per_step / comm.size
     say(ranks, report.entry("rate", f"{rate / 1e6:.3g} million cell updates per second and core"))
     if job.until is None:

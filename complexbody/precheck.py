@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.integrators.entries import Run
 from complexbody.ledger import Bookkeeper
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps
@@ -110,7 +110,7 @@ def _strains(keep: list[int], scale: Array, dim: int) -> Array:
     return left[:, rotations.shape[1] :]
 
 
-def seconds_per_step(run: SynchronousRun, comm: Any, budget: float = 0.3) -> float:
+def seconds_per_step(run: Run, comm: Any, budget: float = 0.3) -> float:
     """Wall time of one step of the slowest rank [s], by timing some; collective."""
     run.advance(2)
     count = 1

@@ -84,12 +84,16 @@ def _value(value: Any) -> str:
     return f"{float(array):.6g}" if array.ndim == 0 else str(array.tolist())
 
 
-def step(step: float, critical: float, until: float | None) -> str:
-    """Step, critical step and number of steps."""
+def step(run: Any, method: Any, until: float | None) -> str:
+    """Step of a run, critical step and number of steps; for local steps the longest one."""
+    step, critical = run.step, run.critical
+    count = "" if until is None else f"; {steps(step, until)} of them to t = {until:g} s"
+    if method.asynchronous:
+        name = "coarse step" if hasattr(method, "levels") else "window"
+        text = f"{name} {step:.6g} s, {step / critical:.3g} times the smallest cell's critical step"
+        return entry("step", f"{text} of {critical:.6g} s{count}")
     share = step / critical
-    text = f"{step:.6g} s, {share:.3g} of the critical {critical:.6g} s"
-    if until is not None:
-        text += f"; {steps(step, until)} of them to t = {until:g} s"
+    text = f"{step:.6g} s, {share:.3g} of the critical {critical:.6g} s{count}"
     return entry("step", text + (" (UNSTABLE)" if share > 1 + 1e-9 else ""))
 
 
@@ -130,7 +134,7 @@ def before(job: Any, name: str, method: Any, plan: Output, until: float) -> list
         mesh(job.scene, s.cells, s.nodes, s.ranks),
         *bodies(job.scene),
         integrator(name, method),
-        step(s.step, s.critical, until),
+        step(job.run_, method, until),
         memory(s.bytes_per_cell, s.cells),
         output(plan, until, job.every),
     ]

@@ -20,6 +20,7 @@ from complexbody.errors import SceneError
 from complexbody.files import CsvWriter
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
+from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper, Ledger
 from complexbody.output import Output, Writer
@@ -85,7 +86,7 @@ class Result:
 
 def simulate(
     scene: Scene,
-    integrator: Synchronous | AVI | None = None,
+    integrator: Synchronous | AVI | LocalLeapfrog | None = None,
     *,
     until: float,
     output: Output | None = None,
@@ -97,7 +98,8 @@ def simulate(
 
     Args:
         scene: What to simulate.
-        integrator: How; ``Synchronous()`` by default.
+        integrator: How; ``Synchronous()`` by default, or ``AVI`` or ``LocalLeapfrog`` where a few
+            small cells would dictate the step of all others.
         until: End of the run [s].
         output: What to write and where; nothing by default.
         ledger_steps: Steps between two ledger rows; by default so many that the books cost some
@@ -131,7 +133,7 @@ class Simulation:
     def __init__(
         self,
         scene: Scene,
-        integrator: Synchronous | AVI | None = None,
+        integrator: Synchronous | AVI | LocalLeapfrog | None = None,
         *,
         until: float,
         output: Output | None = None,
@@ -316,6 +318,7 @@ class Simulation:
         for thing in (self.writer, self.csv, self.receivers):
             if thing is not None:
                 thing.close()
+        self.run_.close()
         self.problem.close()
 
 

@@ -492,3 +492,8 @@ class AVIRun:
             surplus=kinetic + common["stored"] + common["potential"] - given,
             discrete=0.0, flows=0.0, size=0.0, variation_u=np.nan, variation_nu=np.nan,
         )  # fmt: skip
+
+    def close(self) -> None:
+        """Free the run's own communicator; collective."""
+        if self.halo is not self.problem.disc.halo:
+            self.halo.close()

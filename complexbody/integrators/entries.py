@@ -96,6 +96,9 @@ class Run(Protocol):
     def entries(self) -> Entries:
         """The books at the time reached, this rank's share."""
 
+    def close(self) -> None:
+        """Free communicators of the run's own."""
+
 
 def half_quadratic(problem: Problem, matrix: Array, w: Array, first: int, last: int) -> float:
     """½ Σ_a V_a w·m w over this rank's nodes and components [first, last), m per class (n, n)."""

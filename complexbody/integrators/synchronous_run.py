@@ -287,3 +287,6 @@ class SynchronousRun:
     def entries(self) -> Entries:
         """Energies and works at t_n, and the discrete energy of the last half step; collective."""
         return entries(self)
+
+    def close(self) -> None:
+        """Do nothing: messages are the problem's."""
