@@ -14,6 +14,7 @@ from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
+from complexbody.precheck import realised_speed_up
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
 from complexbody.simulate import Result, simulate
 
@@ -35,6 +36,7 @@ __all__ = [
     "Traction",
     "constant",
     "ramp",
+    "realised_speed_up",
     "ricker",
     "simulate",
     "sine",

@@ -22,7 +22,7 @@ from mpi4py import MPI
 from complexbody import __version__, commands
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.masses import SCHEMES
-from complexbody.output import CELL_FIELDS, NODE_FIELDS
+from complexbody.output import CELL_FIELDS, NODE_FIELDS, STEP_FIELDS
 from complexbody.together import (
     GRACE,
     Elsewhere,
@@ -192,8 +192,8 @@ def _output(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--fields", metavar="NAMES",
-        help=f"of {', '.join((*NODE_FIELDS, *CELL_FIELDS))}, separated by commas, or none; "
-        f"default {','.join(NODE_FIELDS)}",
+        help=f"of {', '.join((*NODE_FIELDS, *CELL_FIELDS, *STEP_FIELDS))}, separated by commas, "
+        f"or none; default {','.join(NODE_FIELDS)}",
     )  # fmt: skip
     group.add_argument(
         "--probe", metavar="NAME=X,Y,Z", action="append", default=[],
@@ -208,6 +208,10 @@ def _output(to: argparse.ArgumentParser) -> None:
         type=int,
         help="steps between ledger rows; default: a few per cent of the run, at least 100 rows",
     )
+    group.add_argument(
+        "--speed-up", action="store_true",
+        help="local steps: time some synchronous steps in the end, and tell what was saved",
+    )  # fmt: skip
     group.add_argument("--no-picture", action="store_true", help="do not draw")
     group.add_argument("--quiet", action="store_true", help="print only warnings and errors")
 

@@ -67,7 +67,7 @@ _BOTH = (
 )
 OPTIONS = {
     "run": f"{_BOTH} --out --every --fields --probe --probe-steps --ledger-steps --no-picture "
-    "--quiet",
+    "--speed-up --quiet",
     "check": _BOTH,
     "info": "--debug",
 }
@@ -254,8 +254,12 @@ def test_local_steps(bar, call, comm, shared_path, integrator):
     path, out = bar(GRADED), shared_path / "out"
     code, checked, err = call("check", path, "--integrator", integrator)
     assert (code, err) == (0, "")
-    code, text, err = call("run", path, "--integrator", integrator, "--out", out)
+    assert "speed-up over one step for all: 11.3 ideal" in flat(checked)
+    code, text, err = call("run", path, "--integrator", integrator, "--out", out, "--speed-up")
     assert (code, err) == (0, "")
+    assert "speed-up over one step for all: 11.3 ideal" in flat(text)
+    told = [line for line in text.splitlines() if line.startswith("  time sets   steps ")]
+    assert len(told) == 1 and told[0] in checked
     name = {"avi": "window", "local-leapfrog": "coarse step"}[integrator]
     told = [line for line in text.splitlines() if line.startswith(f"  step        {name} ")]
     assert len(told) == 1 and told[0] in checked
@@ -264,6 +268,8 @@ def test_local_steps(bar, call, comm, shared_path, integrator):
     found = record(out)
     assert found["settings"]["integrator"] == integrator
     assert found["statistics"]["step"] > 3 * found["statistics"]["critical"]
+    assert found["time_sets"]["cells"] == 17
+    assert found["time_sets"]["window"] == found["statistics"]["step"]
     # A 17th of the cells steps 32 times as often.
     alone = 17 * found["settings"]["until"] / (0.9 * found["statistics"]["critical"])
     assert found["statistics"]["updates"] < 0.6 * alone

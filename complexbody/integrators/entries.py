@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody import native
+from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
@@ -83,6 +84,10 @@ class Run(Protocol):
     @property
     def time(self) -> float:
         """Time reached [s]."""
+
+    @property
+    def time_sets(self) -> TimeSets | None:
+        """Who acts when; None where all cells act together."""
 
     def advance(self, steps: int) -> None:
         """Do some steps."""
