@@ -19,6 +19,12 @@ from dolfinx import mesh as dmesh
 from complexbody import _compat
 from complexbody._compat import Array, Ints
 from complexbody.errors import MeshError, MissingPackage, agree
+from complexbody.partition import balanced
+
+__all__ = [
+    "Side", "altitudes", "balanced", "box", "graded_interval", "interval", "jiggled",
+    "perforated_plate", "rectangle",
+]  # fmt: skip
 
 #: Facet tags: x = 0 and length, y = 0 and width, z = 0 and thickness, and the wall of the hole.
 Side = IntEnum("Side", "LEFT RIGHT BOTTOM TOP BACK FRONT HOLE")
