@@ -17,6 +17,7 @@ from mpi4py import MPI
 
 from complexbody import native
 from complexbody.integrators.entries import Entries, energies
+from complexbody.integrators.timetable import TimeSets
 from complexbody.kernels import events
 from complexbody.problem import Problem
 
@@ -60,7 +61,10 @@ class RecordRun:
         critical: Critical step of the smallest cell [s], that of a synchronous run.
         updates: Cell updates (forces) done by this rank.
         record: Node records (nodes + 1, doubles per node); the last one is padding.
+        time_sets: Who acts when: what the paper calls Θ, with speed-ups.
     """
+
+    time_sets: TimeSets
 
     record: Array
     inverse_mass: Array
@@ -153,6 +157,11 @@ class RecordRun:
     def time(self) -> float:
         """End of the last beat [s], from the counter."""
         return self.steps * self.step
+
+    def close(self) -> None:
+        """Free the run's own communicator; collective."""
+        if self.halo is not self.problem.disc.halo:
+            self.halo.close()
 
     # --- supports and loads ------------------------------------------------------------------
 
