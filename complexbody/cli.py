@@ -21,6 +21,7 @@ from mpi4py import MPI
 
 from complexbody import __version__, commands
 from complexbody.errors import CommandError, ComplexBodyError
+from complexbody.integrators.asynchronous import SCHEDULES
 from complexbody.masses import SCHEMES
 from complexbody.output import CELL_FIELDS, NODE_FIELDS, STEP_FIELDS
 from complexbody.together import (
@@ -158,8 +159,17 @@ def _integrator(to: argparse.ArgumentParser) -> None:
         help="critical step by a bound of every cell (default) or of the whole body (SLEPc)",
     )  # fmt: skip
     group.add_argument(
+        "--schedule", choices=SCHEDULES,
+        help="avi: repeating windows (default), these with steps in powers of two, or any real steps",
+    )  # fmt: skip
+    group.add_argument(
+        "--corrected", action=argparse.BooleanOptionalAction, default=None,
+        help="avi --schedule exact: softer potentials for cells that act alone (default), or the "
+        "paper's: --no-corrected --start one-sided --dissipation forward",
+    )  # fmt: skip
+    group.add_argument(
         "--balanced", action=argparse.BooleanOptionalAction, default=None,
-        help="avi: act against a smooth reference stress (default), or plainly",
+        help="avi on windows: act against a smooth reference stress (default), or plainly",
     )  # fmt: skip
     group.add_argument(
         "--passes", metavar="N", type=int, help="avi: smoothing passes of the reference; default 2"

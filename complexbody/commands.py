@@ -41,8 +41,8 @@ from complexbody.together import Interrupted, say, together
 #: Integrators by the name that --integrator takes; the first is the default.
 INTEGRATORS = {"synchronous": Synchronous, "avi": AVI, "local-leapfrog": LocalLeapfrog}
 _OPTIONS = (
-    "step", "safety", "dissipation", "start", "critical", "unstable_ok", "balanced",
-    "passes", "filter", "stabilisation", "levels",
+    "step", "safety", "dissipation", "start", "critical", "unstable_ok", "schedule", "balanced",
+    "corrected", "passes", "filter", "stabilisation", "levels",
 )  # fmt: skip
 
 

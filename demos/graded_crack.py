@@ -64,6 +64,8 @@ LENGTH, WIDTH, NOTCH, OPENING, THICKNESS = 2.4, 1.0, 0.9, 0.02, 0.05
 #: What is compared; the first is what updates and times are told against.
 METHODS: dict[str, Any] = {
     "one step for all": cb.Synchronous(),
+    "the published AVI": cb.AVI.as_published(),
+    "real steps, corrected": cb.AVI(schedule="exact"),
     "plain windows": cb.AVI(balanced=False),
     "balanced windows": cb.AVI(),
     "local leapfrog": cb.LocalLeapfrog(),

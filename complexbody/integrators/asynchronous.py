@@ -5,7 +5,7 @@ At an event of cell K its nodes drift to t, the force is taken there, and each n
 h_K times it: (Discr-dAL1), (Discr-dAL2) with the dissipation's sign corrected. What differs is
 when: at the multiples of any h_K ("exact"), or in windows whose order of events repeats. Windows
 may be ``balanced``: against a smooth reference stress taken at the window's start, whose assembled
-force drives the drifts, neighbouring cells need not cancel each other at different times (DESIGN §5).
+force drives the drifts, neighbours need not cancel each other at different times (DESIGN §5).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from complexbody.errors import IntegratorError, StepError, agree
 from complexbody.integrators.exact_run import ExactRun
-from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.exact_schedule import span_length
+from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
@@ -93,17 +93,30 @@ class AVI:
         if self.corrected is None:
             object.__setattr__(self, "corrected", exact)
         for wrong, advice in (
-            (exact and self.balanced, "schedule='exact' has no windows to balance. Use balanced=False"),
-            (whole and self.balanced, "balanced windows kick half at both ends. Use balanced=False, or start='trapezoidal'"),
-            (not exact and self.corrected, "corrected is for cells that act alone. Use schedule='exact'"),
-            (not exact and self.steps is not None, "steps are for schedule='exact'. Use that, or safety"),
-        ):  # fmt: skip
+            (
+                exact and self.balanced,
+                "schedule='exact' has no windows to balance. Use balanced=False",
+            ),
+            (
+                whole and self.balanced,
+                "balanced windows kick half at both ends. Use balanced=False, or "
+                "start='trapezoidal'",
+            ),
+            (
+                not exact and self.corrected,
+                "corrected is for cells that act alone. Use schedule='exact'",
+            ),
+            (
+                not exact and self.steps is not None,
+                "steps are for schedule='exact'. Use that, or safety",
+            ),
+        ):
             if wrong:
                 raise IntegratorError(f"AVI: {advice}.")
 
     @classmethod
     def as_published(cls, safety: float = 0.45, steps: Array | None = None) -> AVI:
-        """The paper's scheme: real steps, one-sided start, dissipation (dissdiscr), its sign corrected."""
+        """The paper's scheme: real steps, one-sided start, (dissdiscr) with its sign corrected."""
         return cls(
             safety, "exact", dissipation="forward", start="one-sided", corrected=False, steps=steps
         )

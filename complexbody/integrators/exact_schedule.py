@@ -59,7 +59,10 @@ class Schedule(ctypes.Structure):
             for name in ("head", "tail", "kicks", "rows_of", "rows", "row_neighbour", "row_place",
                          "outgoing", "out_start", "out_count")
         ),
-        *((name, ctypes.c_int64) for name in ("first_shared", "last_shared", "events", "top", "done")),
+        *(
+            (name, ctypes.c_int64)
+            for name in ("first_shared", "last_shared", "events", "top", "done")
+        ),
         ("trapezoidal", ctypes.c_int32),
     )  # fmt: skip
 
@@ -80,7 +83,7 @@ class ExactSchedule:
     """
 
     def __init__(self, problem: Problem, steps: Array, span: float, trapezoidal: bool) -> None:
-        disc, kernels = problem.disc, problem.kernels
+        disc = problem.disc
         self.halo, self.comm, self.n = disc.halo, problem.comm, disc.n
         cells = disc.blocks * disc.lanes
         original = _compat.original_cells(problem.scene.mesh)

@@ -101,7 +101,7 @@ class RecordRun:
         self._support_force: Array | None = None
         if self._supported:
             self._support_force = self._forces_at(self.record, 0.0)[problem.moving]
-        self._forms = events.Forms(kernels, method.balanced)
+        self._forms = events.Forms(kernels, bool(method.balanced))
         self.world = world = World()
         # Moving supports are late, too, but only shared nodes wait for the other ranks' kicks.
         world.nodes, world.late, world.beyond = disc.nodes, disc.late, disc.late + disc.shared
@@ -117,7 +117,7 @@ class RecordRun:
         world.forms = ctypes.addressof(self._forms.records)
         self._world = ctypes.byref(world)
 
-    def _point(self, **arrays: Array) -> None:
+    def _point(self, **arrays: npt.NDArray[Any]) -> None:
         """Hand arrays, which the run keeps, to the C side."""
         for name, array in arrays.items():
             setattr(self.world, name, array.ctypes.data)
@@ -127,7 +127,7 @@ class RecordRun:
         problem, method = self.problem, self.method
         disc, masses = problem.disc, problem.masses
         n, record = disc.n, disc.record
-        size, self._time, self._inverse = events.record_size(n, record, method.balanced)
+        size, self._time, self._inverse = events.record_size(n, record, bool(method.balanced))
         self.record = native.aligned((disc.nodes + 1, size))
         self.record[:-1, :n] = problem.initial_fields
         self.record[:-1, self._inverse] = 1.0 / disc.volume
@@ -259,7 +259,7 @@ class RecordRun:
 
     def sample(self) -> tuple[Array, Array]:
         """(u, ν) and rates at the last beat's end, node records (nodes + 1, NR)."""
-        problem, kernels, n = self.problem, self.problem.kernels, self.problem.disc.n
+        kernels, n = self.problem.kernels, self.problem.disc.n
         kernels.x[:, :n] = self.record[:, :n]
         self.c.cb_get_rates(self._world, native.pointer(self._rates))
         if self._inert:

@@ -168,7 +168,7 @@ class WindowPlan:
 
 
 def _touched(disc: Discretisation, divisions: list[int]) -> npt.NDArray[np.bool_]:
-    """Shared nodes that cells of N_K equal to each of ``divisions`` touch on any rank; collective."""
+    """Shared nodes that cells of each N_K touch on any rank, (nodes, divisions); collective."""
     flags = np.zeros((disc.nodes + 1, len(divisions)))
     for block in range(disc.boundary_blocks):
         flags[disc.cells[block].ravel(), divisions.index(int(disc.group[block]))] = 1.0

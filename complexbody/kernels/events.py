@@ -98,9 +98,9 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
     defines = {
         "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
         "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1, "COEFFICIENTS": coefficients,
-        "REFERENCES": count, "BALANCED": int(method.balanced), "DAMPED": int(damped),
+        "REFERENCES": count, "BALANCED": int(bool(method.balanced)), "DAMPED": int(damped),
         "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
-        "CORRECTED": int(method.corrected), "PACKED": packed_size(kernels),
+        "CORRECTED": int(bool(method.corrected)), "PACKED": packed_size(kernels),
         "CHUNK": CHUNK, "STRESSES": max(place, default=-1) + 1,
         "PLACES": "{" + ", ".join(map(str, place)) + "}",
     }  # fmt: skip
