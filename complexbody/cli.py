@@ -160,7 +160,7 @@ def _integrator(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--schedule", choices=SCHEDULES,
-        help="avi: repeating windows (default), these with steps in powers of two, or any real steps",
+        help="avi: repeating windows (default), the same by powers of two, or any real steps",
     )  # fmt: skip
     group.add_argument(
         "--corrected", action=argparse.BooleanOptionalAction, default=None,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-r"""A pulse meets a crack: cells graded by 80 towards its tip, and four ways to step them.
+r"""A pulse meets a crack: cells graded by 80 towards its tip, and five ways to step them.
 
 A plate 2.4 × 1 with a sharp notch of length 0.9 from the left is struck on its upper edge. Edges
 at the tip are 80 times shorter than those far away, and of 10 000 triangles nine tenths are large.
@@ -19,15 +19,16 @@ gives :math:`\rho\ddot u = \mathrm{Div}\,P` and
 Ricker pulse. The lower edge is held; all others are free, those of the notch included, and nothing
 keeps its faces from overlapping. At the tip the stresses are singular, hence the fine mesh.
 
-**Methods.** One step for all (leapfrog at 0.9 of the critical step), asynchronous windows, plain
-(every cell its own rational time set) and balanced, and local leapfrog at 0.9 and, like the
-windows, at 0.45. ``check`` runs them all on the same mesh, and compares them with one step for all
+**Methods.** One step for all (leapfrog at 0.9 of the critical step); asynchronous integrators at
+0.45, as the paper has them, with the cells' potentials corrected, on plain windows (every cell its
+own rational time set) and on balanced ones; and local leapfrog at 0.9 and at 0.45. ``check`` runs them all on the same mesh, and compares them with one step for all
 at a quarter of its step: what differs is the error of *time stepping alone*. It should be that of
 the phase of a leapfrog with the method's largest step h,
 
 .. math:: \omega T\,(\omega h)^2/24, \qquad \omega = 2\pi f,
 
-f the frequency of the pulse, and ``check`` asserts that it is no more than twice that. The mesh
+f the frequency of the pulse, and ``check`` asserts that it is no more than twice that. Where every
+cell acts alone, at any real multiple of its step, it is not: its ripple leaves ten times as much. The mesh
 itself costs more: 0.025 at forty points at the end, against a mesh 2.5 times as fine. Cell updates
 can be counted on any machine; times (processor time, the best of some) are of this one.
 
@@ -71,6 +72,8 @@ METHODS: dict[str, Any] = {
     "local leapfrog": cb.LocalLeapfrog(),
     "the same at 0.45": cb.LocalLeapfrog(safety=0.45),
 }
+#: Cells that act alone leave a ripple on their nodes: a floor and a noise, not a phase.
+ALONE = ("the published AVI", "real steps, corrected")
 #: The reference makes so many steps where one step for all makes one.
 FINER = 4
 #: The shortest time of so many runs counts.
@@ -179,10 +182,10 @@ class Norm:
 def table(rows: list[Row]) -> str:
     """Rows as text, updates and times relative to the first."""
     names = ("error u, ν", "of rates", "largest step", "updates", "ratio", "time")
-    lines = ["{:16} {:>11} {:>9} {:>13} {:>9} {:>6} {:>6}".format("", *names)]
+    lines = ["{:22} {:>11} {:>9} {:>13} {:>9} {:>6} {:>6}".format("", *names)]
     for row in rows:
         lines.append(
-            f"{row.name:16} {row.error:11.1e} {row.rate_error:9.1e} {row.step:13.2e} "
+            f"{row.name:22} {row.error:11.1e} {row.rate_error:9.1e} {row.step:13.2e} "
             f"{row.updates:9.2e} {row.updates / rows[0].updates:6.2f} "
             f"{row.seconds / rows[0].seconds:6.2f}"
         )
@@ -205,6 +208,10 @@ def check(result: cb.Result) -> str:
         (result.folder / "methods.txt").write_text(table(rows) + "\n", encoding="utf-8")
     omega = 2 * np.pi * result.scene.loads[0].history.frequency
     for row in rows:
+        if row.name in ALONE:
+            balanced_error = next(r.error for r in rows if r.name == "balanced windows")
+            assert row.error > 3 * balanced_error, f"{row.name} shows no floor: {row.error:.1e}"
+            continue
         phase = omega * result.time * (omega * row.step) ** 2 / 24
         assert row.error < 2 * phase, f"{row.name}: error {row.error:.1e}, of phase {phase:.1e}"
     for row in rows[1:]:
