@@ -17,7 +17,7 @@ typedef struct { double time; int64_t index; } entry; /* before it is known who 
 typedef struct {
   double time;
   int32_t actor, waits;    /* cell, or cells + visit; for so many others, and for a kick to come in */
-  int32_t next[SLOTS];     /* who waits for it at each of its nodes, or -1 */
+  int32_t next[SLOTS];     /* who waits for it at each of its nodes, or one that waits for ever */
 } event;
 
 typedef struct {
@@ -50,6 +50,7 @@ typedef struct {
   int32_t trapezoidal;
 } schedule;
 
+#define CROWD 24 /* events of a bucket of time that are too many for insertion */
 #define AHEAD 12 /* events whose data is fetched while earlier ones are worked on */
 
 /* By time; of two at one time the one of the smaller index. */
@@ -69,7 +70,11 @@ static void in_order(schedule *x, double t0, double t1) {
     const double h = x->step[i];
     for (int64_t j = x->counter[i]; j * h < t1; j++) x->bucket[BUCKET(j * h) + 1]++;
   }
-  for (int64_t b = 0; b < x->buckets; b++) x->bucket[b + 1] += x->bucket[b];
+  int crowded = 0;
+  for (int64_t b = 0; b < x->buckets; b++) {
+    crowded |= x->bucket[b + 1] > CROWD;
+    x->bucket[b + 1] += x->bucket[b];
+  }
   x->events = x->bucket[x->buckets];
   for (int64_t i = 0; i < all; i++) {
     const double h = x->step[i];
@@ -77,21 +82,19 @@ static void in_order(schedule *x, double t0, double t1) {
     for (; j * h < t1; j++) x->list[x->bucket[BUCKET(j * h)]++] = (entry){j * h, i};
     x->counter[i] = j;
   }
-  for (int64_t b = 0, first = 0; b < x->buckets; first = x->bucket[b++]) {
+  for (int64_t b = 0, first = 0; crowded && b < x->buckets; first = x->bucket[b++]) {
     entry *e = x->list + first;
     const int64_t count = x->bucket[b] - first;
-    if (count > 24) {
-      int64_t sorted = 1; /* meshes of equal cells give crowds of equal times, in order already */
-      while (sorted < count && e[sorted - 1].time <= e[sorted].time) sorted++;
-      if (sorted < count) qsort(e, count, sizeof(entry), by_time);
-    } else {
-      for (int64_t i = 1; i < count; i++) {
-        const entry moved = e[i];
-        int64_t f = i;
-        for (; f > 0 && e[f - 1].time > moved.time; f--) e[f] = e[f - 1];
-        e[f] = moved;
-      }
-    }
+    int64_t sorted = 1; /* meshes of equal cells give crowds of equal times, in order already */
+    if (count <= CROWD) continue;
+    while (sorted < count && e[sorted - 1].time <= e[sorted].time) sorted++;
+    if (sorted < count) qsort(e, count, sizeof(entry), by_time);
+  }
+  for (int64_t e = 1; e < x->events; e++) { /* nearly sorted by now; equal times stay as they are */
+    const entry moved = x->list[e];
+    int64_t f = e;
+    for (; f > 0 && x->list[f - 1].time > moved.time; f--) x->list[f] = x->list[f - 1];
+    if (f < e) x->list[f] = moved;
   }
 }
 
@@ -121,7 +124,7 @@ int64_t cb_exact_schedule(const world *s, schedule *x, double t0, double t1, int
     }
     event *now = x->event + e;
     *now = (event){x->list[e].time, w, 0, {0}};
-    for (int a = 0; a <= DIM; a++) now->next[a] = -1;
+    for (int a = 0; a <= DIM; a++) now->next[a] = (int32_t)x->events;
     if (w < x->cells) {
       const int32_t *c = x->node + (int64_t)w * SLOTS;
       for (int a = 0; a <= DIM; a++) follow(x, c[a], e, a);
@@ -134,6 +137,7 @@ int64_t cb_exact_schedule(const world *s, schedule *x, double t0, double t1, int
       x->tail[row] = e;
     }
   }
+  x->event[x->events].waits = INT32_MAX;
   for (int64_t e = x->events - 1; e >= 0; e--) /* the earliest on top */
     if (!x->event[e].waits) x->stack[x->top++] = (int32_t)e;
   return x->events;
@@ -141,11 +145,9 @@ int64_t cb_exact_schedule(const world *s, schedule *x, double t0, double t1, int
 
 /* Event e waits for one less; visits are done at once. */
 static void release(const world *s, schedule *x, int32_t e) {
-  while (e >= 0 && --x->event[e].waits == 0) {
+  while (--x->event[e].waits == 0) {
     const int32_t w = x->event[e].actor;
     if (w < x->cells) {
-      __builtin_prefetch(x->node + (int64_t)w * SLOTS);
-      for (int i = 0; i < PACKED; i += 8) __builtin_prefetch(x->packed + (int64_t)w * PACKED + i);
       x->stack[x->top++] = e;
       return;
     }
@@ -157,6 +159,18 @@ static void release(const world *s, schedule *x, int32_t e) {
     impulse(s, a, x->kicks + (int64_t)e * N, r[INVERSE], r + NR);
     x->done++;
     e = x->event[e].next[0];
+  }
+}
+
+/* All that wait for an event wait for one less. Without visits there is nothing to branch for. */
+INLINE void release_all(const world *s, schedule *x, const event *e) {
+  for (int a = 0; a <= DIM; a++) {
+    if (x->visits) {
+      release(s, x, e->next[a]);
+    } else {
+      x->stack[x->top] = e->next[a];
+      x->top += --x->event[e->next[a]].waits == 0;
+    }
   }
 }
 
@@ -204,37 +218,54 @@ static void act_alone(const world *s, schedule *x, const int32_t *which, int cou
   for (int a = 0; a <= DIM; a++) kick(s, c + a * W, weight, out[a]);
   if (x->last_shared > x->first_shared)
     for (int a = 0; a <= DIM; a++) emit(x, c + a * W, weight, out[a], count);
-  for (int l = 0; l < count; l++)
-    for (int a = 0; a <= DIM; a++) release(s, x, x->event[which[l]].next[a]);
+  for (int l = 0; l < count; l++) release_all(s, x, x->event + which[l]);
   x->done += count;
 }
 
-/* Up to W events of one region that wait for nothing; their data is on its way. */
-static int take(const world *s, schedule *x, int32_t *which) {
+typedef struct { int count; int32_t which[W]; } lot;
+
+/* Up to W events of one region that wait for nothing: their cells' data is sent for. */
+static void take(schedule *x, lot *l) {
 #define REGION(e) x->region[x->event[e].actor]
-  int count = 0;
-  while (count < W && x->top > 0 &&
-         (!count || REGION(x->stack[x->top - 1]) == REGION(which[0]))) {
-    const int32_t e = which[count++] = x->stack[--x->top];
-    const int32_t *c = x->node + (int64_t)x->event[e].actor * SLOTS;
-    for (int a = 0; a <= DIM; a++) {
-      for (int i = 0; i < RECORD; i += 8) __builtin_prefetch(record_of(s, c[a]) + i, 1);
-      if (x->event[e].next[a] >= 0) __builtin_prefetch(x->event + x->event[e].next[a], 1);
-    }
+  l->count = 0;
+  while (l->count < W && x->top > 0) {
+    const int32_t e = x->stack[x->top - 1], w = x->event[e].actor;
+    if (l->count && x->region[w] != REGION(l->which[0])) break;
+    l->which[l->count++] = e;
+    x->top--;
+    __builtin_prefetch(x->node + (int64_t)w * SLOTS);
+    for (int i = 0; i < PACKED; i += 8) __builtin_prefetch(x->packed + (int64_t)w * PACKED + i);
+    for (int a = 0; a <= DIM; a++) __builtin_prefetch(x->event + x->event[e].next[a], 1);
   }
-  return count;
 }
 
-/* Do all events that wait for nothing: each lot is taken before the last one acts, so that its data
- * has time to come. Events that wait for nothing share no node. */
+/* Their nodes' records are sent for. */
+static void fetch(const world *s, const schedule *x, const lot *l) {
+  for (int i = 0; i < l->count; i++) {
+    const int32_t *c = x->node + (int64_t)x->event[l->which[i]].actor * SLOTS;
+    for (int a = 0; a <= DIM; a++)
+      for (int j = 0; j < RECORD; j += 8) __builtin_prefetch(record_of(s, c[a]) + j, 1);
+  }
+}
+
+/* Do all events that wait for nothing, two lots on their way while one acts: their data has time to
+ * come. Events that wait for nothing share no node, so they may be taken before others act. */
 void cb_exact_go(const world *s, schedule *x) {
-  int32_t lots[2][W];
-  int now = 0, count = take(s, x, lots[0]);
-  while (count > 0) {
-    const int more = take(s, x, lots[1 - now]);
-    act_alone(s, x, lots[now], count);
-    now = 1 - now;
-    count = more > 0 ? more : take(s, x, lots[now]);
+  lot lots[3];
+  take(x, lots);
+  fetch(s, x, lots);
+  take(x, lots + 1);
+  for (int i = 0; lots[i].count > 0; i = (i + 1) % 3) {
+    lot *next = lots + (i + 1) % 3, *after = lots + (i + 2) % 3;
+    fetch(s, x, next);
+    take(x, after);
+    act_alone(s, x, lots[i].which, lots[i].count);
+    if (!next->count && after->count) { /* none may stand behind an empty lot */
+      *next = *after;
+      after->count = 0;
+    }
+    if (!next->count) take(x, next);
+    if (next->count && !after->count) take(x, after);
   }
 }
 
