@@ -96,11 +96,13 @@ void run(const world *s, entry *heap, int64_t cells, const int32_t *nodes, const
 """
 
 
-def scene(dim: int, cells: int, grade: float, viscosity: float) -> cb.Scene:
+def scene(
+    dim: int, cells: int, grade: float, viscosity: float, comm: Any = MPI.COMM_SELF
+) -> cb.Scene:
     """A coupled body of 2·dim components; cell sizes grow by ``grade`` along each axis."""
     m = max(2, round((cells / (6 if dim == 3 else 2)) ** (1 / dim)))
     make = meshes.box if dim == 3 else meshes.rectangle
-    mesh = meshes.jiggled(make(MPI.COMM_SELF, [0] * dim, [1] * dim, m), 0.15, 1)
+    mesh = meshes.jiggled(make(comm, [0] * dim, [1] * dim, m), 0.15, 1)
     x = mesh.geometry.x
     if grade > 1:
         x[:, :dim] = np.expm1(np.log(grade) * x[:, :dim]) / (grade - 1)
