@@ -157,14 +157,8 @@ def _integrator(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--balanced", action=argparse.BooleanOptionalAction, default=None,
-        help="avi: act against a smooth reference stress (default), or plainly",
+        help="avi: forces act through the steps (default), or in kicks",
     )  # fmt: skip
-    group.add_argument(
-        "--passes", metavar="N", type=int, help="avi: smoothing passes of the reference; default 2"
-    )
-    group.add_argument(
-        "--filter", metavar="E", type=float, help="avi: strength of the rates' filter; default 0.01"
-    )
     group.add_argument(
         "--unstable-ok", action="store_true", default=None,
         help="allow a step above the critical one, and energy that grows",

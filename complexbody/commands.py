@@ -40,7 +40,6 @@ from complexbody.together import Interrupted, say, together
 INTEGRATORS = {"synchronous": Synchronous, "avi": AVI}
 _OPTIONS = (
     "step", "safety", "dissipation", "start", "critical", "unstable_ok", "balanced",
-    "passes", "filter",
 )  # fmt: skip
 
 
