@@ -182,23 +182,25 @@ def watch(run: Any) -> dict[str, float]:
 
 @dataclass
 class Row:
-    """A line of the table: ``call`` does ``updates``, a unit of the body's time needs ``rate``."""
+    """A line of the table: ``call`` works, ``done`` counts updates, ``rate`` is what it needs."""
 
     call: Callable[[], None]
-    updates: int
-    rate: float
+    done: Callable[[], float]  # updates so far
+    rate: float  # updates per unit of the body's time
     bytes: float
-    setup: float = 0.0  # of the call's time, in a run of 1000 windows
+    setup: float = 0.0  # [s]
     shares: dict[str, float] = field(default_factory=dict)
-    best: float = np.inf
+    best: float = np.inf  # seconds per update
     told: dict[str, float] = field(default_factory=dict)
 
     def take(self) -> None:
         """Once more."""
         self.shares.update(dict.fromkeys(self.shares, 0.0))
+        before = self.done()
         taken = spent(self.call)
-        if taken < self.best:
-            self.best, self.told = taken, {p: s / taken for p, s in self.shares.items() if s}
+        each = taken / (self.done() - before)
+        if each < self.best:
+            self.best, self.told = each, {p: s / taken for p, s in self.shares.items() if s}
 
 
 def asynchronous(method: Any, problem: Callable[[], Problem]) -> tuple[Row, Any]:
@@ -209,16 +211,16 @@ def asynchronous(method: Any, problem: Callable[[], Problem]) -> tuple[Row, Any]
     run.advance(1)
     before = run.updates
     run.advance(1)
-    updates = run.updates - before
-    windows = max(1, round(3e6 / updates))
+    beats = max(1, round(3e6 / (run.updates - before)))
+    rate = (run.updates - before) / run.step
+    if hasattr(run, "steps_of"):  # real steps: spans differ in their events
+        rate = float(np.sum(1.0 / run.steps_of))
     parts = [run, *(getattr(run, name, None) for name in ("plan", "balance", "schedule"))]
     own = [value for part in parts if part is not None for value in vars(part).values()]
     arrays = {id(a): a.nbytes for a in own if isinstance(a, np.ndarray)}
     size = run.problem.kernels.bytes_per_cell() + sum(arrays.values()) / run.problem.disc.count
-    return Row(
-        lambda: run.advance(windows), windows * updates, updates / run.step, size,
-        setup * windows / 1000, watch(run),
-    ), run  # fmt: skip
+    shares = watch(run)
+    return Row(lambda: run.advance(beats), lambda: run.updates, rate, size, setup, shares), run
 
 
 def measure(dim: int, cells: int, grade: float, viscosity: float, repeats: int) -> None:
@@ -227,37 +229,38 @@ def measure(dim: int, cells: int, grade: float, viscosity: float, repeats: int) 
     one = cb.Synchronous().prepare(problem(), UNTIL)
     count, size = one.problem.disc.count, one.problem.kernels.bytes_per_cell()
     steps = max(1, round(3e6 / count))
-    sync = Row(lambda: one.advance(steps), steps * count, count / one.step, size)
+    sync = Row(lambda: one.advance(steps), lambda: one.steps * count, count / one.step, size)
     rows, sets = {"synchronous": sync}, None
     for name, method in METHODS.items():
         rows[name], run = asynchronous(method, problem)
         sets = getattr(run, "time_sets", sets)  # windows have them
     if viscosity == 0:
         heap = Heap(one.problem, AVI().safety)
-        rows["heap"] = Row(lambda: heap.events(10**6), 10**6, heap.rate, heap.bytes() / count)
+        call = lambda: heap.events(10**6)  # noqa: E731
+        rows["heap"] = Row(call, lambda: heap.count.sum(), heap.rate, heap.bytes() / count)
     arrays = [native.aligned((1 << 23,)) for _ in range(3)]
     triad, addresses = native.load(TRIAD).triad, [native.pointer(a) for a in arrays]
-    sweep = Row(lambda: triad(ctypes.c_long(1 << 23), *addresses), 1 << 23, 0, 24)
+    sweep, seconds = (lambda: triad(ctypes.c_long(1 << 23), *addresses)), np.inf
     for _ in range(repeats):
-        for row in (*rows.values(), sweep):
+        for row in rows.values():
             row.take()
+        seconds = min(seconds, spent(sweep))
     assert sets is not None
-    unit = sync.best / sync.updates
     print(
         f"\n{dim}D, {count} cells, {2 * dim} components, steps 1 to {sets.asynchronicity:.0f}, "
-        f"ideal speed-up {sets.ideal:.2f}, triad {24e-9 * sweep.updates / sweep.best:.1f} GB/s"
+        f"ideal speed-up {sets.ideal:.2f}, triad {24e-9 * (1 << 23) / seconds:.1f} GB/s"
     )
     print(
         f"{'':18}{'ns':>7}{'updates':>9}{'M/s':>7}{'scheduled':>11}{'realised':>10}"
         f"{'bytes/cell':>12}{'set-up':>9}   of it"
     )
     for name, row in rows.items():
-        each, scheduled = row.best / row.updates, sync.rate / row.rate
+        each, scheduled = row.best / sync.best, sync.rate / row.rate
+        setup = 100 * row.setup / (1000 * sets.window * row.rate * row.best)
         parts = ", ".join(f"{part} {100 * share:.0f} %" for part, share in row.told.items())
         print(
-            f"{name:18}{each * 1e9:7.1f}{each / unit:9.2f}{1e-6 / each:7.1f}{scheduled:11.2f}"
-            f"{scheduled * unit / each:10.2f}{row.bytes:12.0f}{100 * row.setup / row.best:7.1f} %"
-            f"   {parts}".rstrip(),
+            f"{name:18}{row.best * 1e9:7.1f}{each:9.2f}{1e-6 / row.best:7.1f}{scheduled:11.2f}"
+            f"{scheduled / each:10.2f}{row.bytes:12.0f}{setup:7.1f} %   {parts}".rstrip(),
             flush=True,
         )
 

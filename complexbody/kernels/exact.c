@@ -2,7 +2,7 @@
  * Exact schedules: cell K acts at j h_K, j = 0, 1, ..., with h_K any real number. Behind events.h and
  * the regions' lone functions; needs LONE(region, ...), PACKED.
  *
- * A span's events are put in order of time once (ties by the cells' global numbers). Each then waits
+ * A span's events are put in order of time once (ties by the cells' ranks and global numbers). Each then waits
  * only for the events before it on its own nodes: those that wait for nothing lie on a stack, share
  * no node, and act W at a time; last in, first out keeps to cells whose data is at hand. Another
  * rank's event is a *visit* to each shared node it touches: it waits for its kick to come in, too. So
@@ -25,7 +25,7 @@ typedef struct {
   const double *packed;     /* [cell][PACKED] */
   const int32_t *node;      /* [cell][SLOTS]: once more, close together */
   const int32_t *region;    /* [cell] */
-  const double *step;       /* of cells and visits by global number: [index]; infinite for padding */
+  const double *step;       /* of cells and visits by rank and global number: [index] */
   int64_t *counter;         /* [index]: the next event's j */
   const int32_t *actor;     /* [index]: cell, or cells + visit */
   const int32_t *index;     /* [cell] */
@@ -52,7 +52,7 @@ typedef struct {
 
 #define AHEAD 12 /* events whose data is fetched while earlier ones are worked on */
 
-/* By time; of two at one time the cell of the smaller global number. */
+/* By time; of two at one time the one of the smaller index. */
 static int by_time(const void *a, const void *b) {
   const entry *e = a, *f = b;
   return e->time < f->time ? -1 : e->time > f->time ? 1 : (e->index > f->index) - (e->index < f->index);

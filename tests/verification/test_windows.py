@@ -237,7 +237,7 @@ def reference(run, case, make=None):
     }  # fmt: skip
     out = make(**given) if make else Windows(
         divisions=divisions_of(run), balanced=method.balanced, passes=method.passes,
-        filter=method.filter, **given,
+        filter=method.filter, start=method.start, **given,
     )  # fmt: skip
     if case.loads:
         side, zero = traction_nodes(points, cells), np.zeros((len(points), n))
@@ -310,6 +310,16 @@ def test_trajectories(comm, name, scheme, balanced):
     compare(run, plain, 5)
 
 
+@pytest.mark.parametrize("name, scheme", [(n, schemes(CASES[n])[-1]) for n in CASES])
+def test_one_sided(comm, name, scheme):
+    """The paper's start on windows: whole kicks at their starts, none at their ends."""
+    run = prepared(build(comm, CASES[name]), AVI(dissipation=scheme, start="one-sided"), 10.0)
+    assert not run.method.balanced
+    plain, cells = reference(run, CASES[name]), len(divisions_of(run))
+    compare(run, plain, 4)
+    assert comm.allreduce(run.updates) == 4 * plain.divisions.sum() >= 4 * cells
+
+
 @pytest.mark.parametrize("lanes", [4, 8])
 @pytest.mark.parametrize("balanced", [False, True], ids=["plain", "balanced"])
 @pytest.mark.parametrize("name", ["n2 lumped", "n3", "n4 blocks", "n6", "quartic region"])
@@ -344,14 +354,16 @@ def test_options(comm, passes, strength, safety):
     "name, scheme",
     [(n, s) for n in ("n3", "n4 blocks", "n4 half of it", "quartic region") for s in schemes(CASES[n])],
 )
-def test_equal_steps_are_synchronous(comm, name, scheme):
+@pytest.mark.parametrize("start", ["trapezoidal", "one-sided"])
+def test_equal_steps_are_synchronous(comm, name, scheme, start):
     """If no cell divides the window, plain windows are the synchronous integrator."""
     case = CASES[name]
     scene = build(comm, case)
     step = 0.6 * critical_step(Problem(scene), scheme)
-    run = prepared(scene, AVI(balanced=False, dissipation=scheme, safety=0.9), step)
+    method = AVI(balanced=False, dissipation=scheme, safety=0.9, start=start)
+    run = prepared(scene, method, step)
     assert run.step == step and set(divisions_of(run)) == {1}
-    other = prepared(scene, cb.Synchronous(step, dissipation=scheme))
+    other = prepared(scene, cb.Synchronous(step, dissipation=scheme, start=start))
     moving = np.zeros(case.n, bool)
     if case.supports == "moving":
         moving[: case.n_u + 1] = True  # rates of moving supports are defined otherwise

@@ -225,15 +225,18 @@ class Windows:
         fixed: Prescribed components (nodes, n).
         targets: Prescribed values (nodes, n) as a function of t; by default they stay.
         loads: Pairs of nodal forces (nodes, n) and a factor as a function of t.
-        balanced, passes, filter, scheme: As for cb.AVI.
+        balanced, passes, filter, scheme, start: As for cb.AVI.
     """
 
     def __init__(
         self, cells, potentials, divisions, window, masses, viscosities, q, rates, fixed=None,
         targets=None, loads=(), balanced=True, passes=2, filter=0.01, scheme="exact",
+        start="trapezoidal",
     ):  # fmt: skip
         self.cells, self.potentials, self.divisions = cells, potentials, divisions
         self.window, self.balanced, self.passes, self.epsilon = window, balanced, passes, filter
+        # One-sided: what acts at a window's start acts with its whole step, nothing at its end.
+        self.first = 1.0 if start == "one-sided" else 0.5
         self.size, self.n = q.shape
         self.fixed = np.zeros(q.shape, bool) if fixed is None else fixed
         self.loads = [*loads, (self._assemble([p.constant for p in potentials]), lambda t: 1.0)]
@@ -288,9 +291,9 @@ class Windows:
             self.F = self._assemble(against) + self.load(start + W / 2)
         else:
             against = zero
-            self._kick_nodes(W / 2 * self.load(start))
+            self._kick_nodes(self.first * W * self.load(start))
         for K, N in enumerate(self.divisions):
-            self._act(K, Fraction(0), W / N / 2, against)
+            self._act(K, Fraction(0), self.first * W / N, against)
         heap = [(Fraction(1, int(N)), K, 1) for K, N in enumerate(self.divisions) if N > 1]
         heapq.heapify(heap)
         while heap:
@@ -300,12 +303,13 @@ class Windows:
             if j + 1 < N:
                 heapq.heappush(heap, (Fraction(j + 1, N), K, j + 1))
         for K, N in enumerate(self.divisions):
-            self._act(K, Fraction(1), W / N / 2, against)
+            if self.first == 0.5:
+                self._act(K, Fraction(1), W / N / 2, against)
         for a in range(self.size):
             self._drift(a, Fraction(1))  # nodes of no cell would be left behind
         self.count += 1
         if not self.balanced:
-            self._kick_nodes(W / 2 * self.load(self.time))
+            self._kick_nodes((1 - self.first) * W * self.load(self.time))
         elif self.epsilon > 0:
             self._filter()
 
