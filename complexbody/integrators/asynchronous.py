@@ -37,10 +37,11 @@ class AVI:
     Attributes:
         safety: α, the fraction of each cell's critical step it may use. Resonances start near
             0.47 of it on bars of two rates, hence 0.45.
-        schedule: "windows" (N_K = ⌈W/h_K⌉ equal steps per window), "octaves" (N_K rounded up to a
-            power of two) or "exact" (any real h_K, events at its multiples).
+        schedule: "octaves" (N_K = ⌈W/h_K⌉ equal steps per window rounded up to a power of two, and
+            until neighbours differ by two at most; the default), "windows" (N_K as it is; the default
+            if not balanced) or "exact" (any real h_K, events at its multiples).
         balanced: Forces act through the cells' steps, which removes the error floor of asynchronous
-            stepping; the default on windows. False gives plain windows, an AVI of the paper with
+            stepping; the default on octaves, and only there. False gives an AVI of the paper with
             rational time sets, symplectic, with the floor. An exact schedule is plain.
         dissipation: "exact", "symmetric" or "forward", as for Synchronous.
         start: "trapezoidal" (a cell's first kick is a half, order 2) or "one-sided" (the paper's,
@@ -56,7 +57,7 @@ class AVI:
     """
 
     safety: float = 0.45
-    schedule: str = "windows"
+    schedule: str | None = None
     balanced: bool | None = None
     dissipation: str = "exact"
     start: str = "trapezoidal"
@@ -71,6 +72,9 @@ class AVI:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.safety) and 0 < self.safety):
             raise StepError(f"AVI: safety is {self.safety}. Give a positive number, 0.45 or less.")
+        if self.schedule is None:
+            plain = self.balanced is False or self.start == "one-sided"
+            object.__setattr__(self, "schedule", "windows" if plain else "octaves")
         for name, allowed in (
             ("dissipation", SCHEMES),
             ("schedule", SCHEDULES),
@@ -82,12 +86,14 @@ class AVI:
                     f"{', '.join(allowed)}."
                 )
         exact, whole = self.schedule == "exact", self.start == "one-sided"
+        octaves = self.schedule == "octaves"
         if self.balanced is None:
-            object.__setattr__(self, "balanced", not exact and not whole)
+            object.__setattr__(self, "balanced", octaves and not whole)
         if self.corrected is None:
             object.__setattr__(self, "corrected", exact)
         for wrong, advice in (
             (exact and self.balanced, "schedule='exact' has no windows to balance. Use balanced=False"),
+            (not octaves and self.balanced, "balanced windows are stable only where neighbours differ by two. Use schedule='octaves'"),
             (whole and self.balanced, "balanced windows start from the force half a step on. Use balanced=False, or start='trapezoidal'"),
             (not exact and self.corrected, "corrected is for cells that act alone. Use schedule='exact'"),
             (not exact and self.steps is not None, "steps are for schedule='exact'. Use that, or safety"),
@@ -133,8 +139,9 @@ class AVI:
             blocks = np.full(critical.shape, np.inf)
             blocks[real] = np.where(np.isfinite(steps), steps, window)[disc.source_cell[real]]
             return ExactRun(problem, self, span_length(blocks, until, problem.comm), blocks, own)
-        counts = divisions(steps, window, self.schedule == "octaves")
-        problem.arrange(graded(problem, counts) if self.balanced else counts)
+        octaves = self.schedule == "octaves"
+        counts = divisions(steps, window, octaves)
+        problem.arrange(graded(problem, counts) if octaves else counts)
         return WindowRun(problem, self, window, own)
 
     def _given(self, problem: Problem, critical: Array) -> Array:
