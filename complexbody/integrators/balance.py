@@ -99,9 +99,9 @@ def coupling(problem: Problem, number: int) -> Array:
         scale = np.einsum("cii,cjj->cij", one, other)
         ratio = np.where(size > 0, size**2 / np.where(scale > 0, scale, size**2 + 1e-300), 0.0)
         out = np.maximum(out, ratio.max(axis=0, initial=0.0))
-    out = np.minimum(problem.comm.allreduce(out, op=MPI.MAX), 1.0)
+    problem.comm.Allreduce(MPI.IN_PLACE, out, op=MPI.MAX)
     np.fill_diagonal(out, 0.0)
-    return out
+    return np.minimum(out, 1.0)
 
 
 class Balance:
