@@ -11,8 +11,10 @@ from complexbody.body import Body
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
+from complexbody.precheck import realised_speed_up
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
 from complexbody.simulate import Result, simulate
 
@@ -25,6 +27,7 @@ __all__ = [
     "ComplexBodyError",
     "Fix",
     "Initial",
+    "LocalLeapfrog",
     "Output",
     "Pressure",
     "Result",
@@ -33,6 +36,7 @@ __all__ = [
     "Traction",
     "constant",
     "ramp",
+    "realised_speed_up",
     "ricker",
     "simulate",
     "sine",

@@ -7,6 +7,7 @@ Everything is probed with ``hasattr``; no other file may ask for a version.
 from __future__ import annotations
 
 import inspect
+import itertools
 import logging
 from importlib import import_module
 from importlib.util import find_spec
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import fem, jit, la, mesh, plot
+from dolfinx import cpp, fem, io, jit, la, mesh, plot
 
 # dolfinx 0.5's JIT logs every compilation at level INFO through the root logger.
 for _handler in logging.getLogger().handlers:
@@ -188,8 +189,11 @@ def mesh_from_gmsh(model: Any, comm: Any, rank: int = 0, gdim: int = 3) -> tuple
     return out[0], out[1], out[2]
 
 
-def create_mesh(comm: Any, cells: Any, points: Array, ufl_mesh: Any = None) -> mesh.Mesh:
-    """A simplicial mesh from global cells (int64) and points (float64) given by each rank."""
+def create_mesh(comm: Any, cells: Any, points: Array, ranks: Ints | None = None) -> mesh.Mesh:
+    """A simplicial mesh from global cells (int64) and points (float64) given by each rank.
+
+    ``ranks`` says where each of the cells given by this rank goes; else a graph partitioner does.
+    """
     tdim = cells.shape[1] - 1
     name = {1: "interval", 2: "triangle", 3: "tetrahedron"}[tdim]
     gdim = points.shape[1]
@@ -204,12 +208,66 @@ def create_mesh(comm: Any, cells: Any, points: Array, ufl_mesh: Any = None) -> m
     domain = ufl.Mesh(element)
     none = mesh.GhostMode.none
     if "ghost_mode" in inspect.signature(mesh.create_mesh).parameters:  # 0.5
-        return mesh.create_mesh(comm, cells, points, domain, ghost_mode=none)
+        given = {}
+        if ranks is not None:
+            given["partitioner"] = lambda *asked: _with_neighbours(comm, ranks, asked[3], asked[2])
+        return mesh.create_mesh(comm, cells, points, domain, ghost_mode=none, **given)
     partitioner = mesh.create_cell_partitioner(none)
+    if ranks is not None:
+        offsets = np.arange(len(ranks) + 1, dtype=np.int32)
+        partitioner = lambda *_: cpp.graph.AdjacencyList_int32(ranks, offsets)  # noqa: E731
     try:
         return mesh.create_mesh(comm, cells, points, domain, partitioner=partitioner)
     except TypeError:  # 0.10 moved the element before the points
         return mesh.create_mesh(comm, cells, domain, points, partitioner=partitioner)
+
+
+def _with_neighbours(comm: Any, ranks: Ints, cells: Any, tdim: int) -> Any:
+    """Ranks of cells, and of their neighbours over facets, as 0.5 wants them; collective.
+
+    It finds out which ranks share a node from ghost cells, which it then removes.
+    """
+    graph = cpp.mesh.build_dual_graph(comm, cells, tdim)
+    neighbours = np.asarray(graph.array)
+    own = np.repeat(np.arange(len(ranks)), np.diff(graph.offsets))
+    first = np.concatenate([[0], np.cumsum(comm.allgather(len(ranks)))])
+    wanted, at = np.unique(neighbours, return_inverse=True)
+    cut = np.searchsorted(wanted, first)
+    asked = comm.alltoall([wanted[a:b] for a, b in itertools.pairwise(cut)])
+    heard = comm.alltoall([ranks[part - first[comm.rank]] for part in asked])
+    beside = np.concatenate(heard)[at]
+    ghost = beside != ranks[own]
+    pairs = np.unique(np.stack([own[ghost], beside[ghost]]), axis=1)
+    # The owner comes first.
+    cell = np.concatenate([np.arange(len(ranks)), pairs[0]])
+    order = np.argsort(cell, kind="stable")
+    offsets = np.searchsorted(cell[order], np.arange(len(ranks) + 1)).astype(np.int32)
+    out = np.concatenate([ranks, pairs[1]])[order].astype(np.int32)
+    return cpp.graph.AdjacencyList_int32(out, offsets)
+
+
+def facet_nodes(domain: mesh.Mesh, facets: Ints) -> Ints:
+    """Geometry nodes of facets of a simplicial mesh, shape (facets, d)."""
+    tdim = domain.topology.dim
+    domain.topology.create_connectivity(tdim - 1, tdim)
+    domain.topology.create_connectivity(tdim, tdim - 1)
+    to_cell = domain.topology.connectivity(tdim - 1, tdim)
+    to_facet = domain.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
+    cells = to_cell.array[to_cell.offsets[facets]]
+    # Facet i of a simplex lies opposite to its vertex i.
+    beside = to_facet[cells] != np.asarray(facets)[:, None]
+    return cell_nodes(domain)[cells][beside].reshape(-1, tdim)
+
+
+def tags_from_nodes(domain: mesh.Mesh, dim: int, nodes: Any, values: Any) -> Any:
+    """Tags of entities that any rank gives by the input numbers of their nodes; collective."""
+    given = np.ascontiguousarray(nodes, dtype=np.int64), np.asarray(values, dtype=np.int32)
+    # In 0.5 it is the C++ function itself.
+    entities, values = io.distribute_entity_data(getattr(domain, "_mesh", domain), dim, *given)
+    domain.topology.create_connectivity(dim, 0)
+    domain.topology.create_connectivity(dim, domain.topology.dim)
+    table = cpp.graph.AdjacencyList_int32(np.asarray(entities, dtype=np.int32))
+    return mesh.meshtags_from_entities(domain, dim, table, np.asarray(values, dtype=np.int32))
 
 
 def vtk_mesh(domain: mesh.Mesh) -> tuple[Any, Any, Any]:

@@ -21,8 +21,9 @@ from mpi4py import MPI
 
 from complexbody import __version__, commands
 from complexbody.errors import CommandError, ComplexBodyError
+from complexbody.integrators.asynchronous import SCHEDULES
 from complexbody.masses import SCHEMES
-from complexbody.output import CELL_FIELDS, NODE_FIELDS
+from complexbody.output import CELL_FIELDS, NODE_FIELDS, STEP_FIELDS
 from complexbody.together import (
     GRACE,
     Elsewhere,
@@ -66,6 +67,7 @@ to DIR: run.json (what was run, and how it ended), ledger.csv, FIELD.xdmf with F
 examples:
   complexbody run demos/impact.py --set refine=1.5 --every 1e-7 --out results/fine
   complexbody run demos/impact.py --dissipation forward --start one-sided
+  complexbody run demos/impact.py --integrator local-leapfrog --levels 3
   complexbody run demos/impact.py --fields u,stress --probe tip=1,0.5,0 --no-picture
   mpirun -n 4 complexbody run demos/impact.py
 """
@@ -136,13 +138,14 @@ def _integrator(to: argparse.ArgumentParser) -> None:
     names = tuple(commands.INTEGRATORS)
     group.add_argument("--integrator", choices=names, help=f"default {names[0]}")
     group.add_argument(
-        "--step", metavar="H", type=float, help="step [s]; default: safety times the critical step"
-    )
+        "--step", metavar="H", type=float,
+        help="step [s], of local-leapfrog the coarse one; default: safety times the critical step",
+    )  # fmt: skip
     group.add_argument(
         "--safety",
         metavar="S",
         type=float,
-        help="fraction of the critical step; default 0.9 (synchronous), 0.45 (avi)",
+        help="fraction of the critical step; default 0.9 (synchronous, local-leapfrog), 0.45 (avi)",
     )
     group.add_argument(
         "--dissipation", choices=SCHEMES, help="how viscosity is stepped; default exact"
@@ -156,8 +159,25 @@ def _integrator(to: argparse.ArgumentParser) -> None:
         help="critical step by a bound of every cell (default) or of the whole body (SLEPc)",
     )  # fmt: skip
     group.add_argument(
+        "--schedule", choices=SCHEDULES,
+        help="avi: windows, the same by powers of two (default if balanced), or any real steps",
+    )  # fmt: skip
+    group.add_argument(
+        "--corrected", action=argparse.BooleanOptionalAction, default=None,
+        help="avi --schedule exact: softer potentials for cells that act alone (default), or the "
+        "paper's: --no-corrected --start one-sided --dissipation forward",
+    )  # fmt: skip
+    group.add_argument(
         "--balanced", action=argparse.BooleanOptionalAction, default=None,
         help="avi: forces act through the steps (default), or in kicks",
+    )  # fmt: skip
+    group.add_argument(
+        "--stabilisation", metavar="NU", type=float,
+        help="local-leapfrog: ν of the Chebyshev filter; default 0.15, 0 is none",
+    )  # fmt: skip
+    group.add_argument(
+        "--levels", metavar="L", type=int,
+        help="local-leapfrog: octaves of smaller steps; default: as many as cost the least",
     )  # fmt: skip
     group.add_argument(
         "--unstable-ok", action="store_true", default=None,
@@ -176,8 +196,8 @@ def _output(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--fields", metavar="NAMES",
-        help=f"of {', '.join((*NODE_FIELDS, *CELL_FIELDS))}, separated by commas, or none; "
-        f"default {','.join(NODE_FIELDS)}",
+        help=f"of {', '.join((*NODE_FIELDS, *CELL_FIELDS, *STEP_FIELDS))}, separated by commas, "
+        f"or none; default {','.join(NODE_FIELDS)}",
     )  # fmt: skip
     group.add_argument(
         "--probe", metavar="NAME=X,Y,Z", action="append", default=[],
@@ -192,6 +212,10 @@ def _output(to: argparse.ArgumentParser) -> None:
         type=int,
         help="steps between ledger rows; default: a few per cent of the run, at least 100 rows",
     )
+    group.add_argument(
+        "--speed-up", action="store_true",
+        help="local steps: time some synchronous steps in the end, and tell what was saved",
+    )  # fmt: skip
     group.add_argument("--no-picture", action="store_true", help="do not draw")
     group.add_argument("--quiet", action="store_true", help="print only warnings and errors")
 

@@ -26,9 +26,11 @@ from complexbody import machine, precheck, report
 from complexbody.errors import CommandError, MissingPackage
 from complexbody.files import on_first_rank
 from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
 from complexbody.output import NODE_FIELDS, Output, Probes
+from complexbody.precheck import realised_speed_up
 from complexbody.problem import Problem
 from complexbody.rendering import require_vtk
 from complexbody.scene import Scene
@@ -37,9 +39,10 @@ from complexbody.simulate import Result, Simulation, default_ledger_steps
 from complexbody.together import Interrupted, say, together
 
 #: Integrators by the name that --integrator takes; the first is the default.
-INTEGRATORS = {"synchronous": Synchronous, "avi": AVI}
+INTEGRATORS = {"synchronous": Synchronous, "avi": AVI, "local-leapfrog": LocalLeapfrog}
 _OPTIONS = (
-    "step", "safety", "dissipation", "start", "critical", "unstable_ok", "balanced",
+    "step", "safety", "dissipation", "start", "critical", "unstable_ok", "schedule", "balanced",
+    "corrected", "stabilisation", "levels",
 )  # fmt: skip
 
 
@@ -162,6 +165,10 @@ def run(a: argparse.Namespace, ranks: Any) -> None:
         done.update(report.results(result))
         if not a.quiet:
             say(ranks, *report.after(result))
+            if a.speed_up and result.time_sets is not None:
+                with together(ranks):
+                    realised = realised_speed_up(result)
+                say(ranks, report.speed_up(result.time_sets, realised))
         failure = _checked(job.file, result, done, ranks)
         if failure is None and "check" in done and not a.quiet:
             say(ranks, report.entry("check", done["check"]))
@@ -276,11 +283,17 @@ def check(a: argparse.Namespace, ranks: Any) -> None:
         until = job.until if job.until is not None else 100 * found.smallest
         prepared = job.method.prepare(problem, until)
         per_row = precheck.seconds_per_row(Bookkeeper(problem, prepared), comm)
-        per_step = precheck.seconds_per_step(prepared, comm)
+        per_step, sets = precheck.seconds_per_step(prepared, comm), prepared.time_sets
+        told = [report.step(prepared, job.method, job.until), *report.time_sets(sets)]
+        prepared.close()
+        if sets is not None:
+            scheme = job.method.dissipation
+            alone = precheck.synchronous_rate(problem, scheme, until) * prepared.step
+            told.append(report.speed_up(sets, alone / per_step))
         problem.close()
     say(ranks, report.memory(problem.kernels.bytes_per_cell(), cells))
-    say(ranks, report.step(prepared.step, prepared.critical, job.until))
-    rate = cells / per_step / comm.size
+    say(ranks, *told)
+    rate = (cells if sets is None else sets.updates) / per_step / comm.size
     say(ranks, report.entry("rate", f"{rate / 1e6:.3g} million cell updates per second and core"))
     if job.until is None:
         say(ranks, report.entry("time", "give --until T for an estimate"))

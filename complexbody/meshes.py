@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Meshes that scenes often need: boxes, graded intervals, scattered vertices, a plate with a hole.
+"""Meshes that scenes often need: boxes, graded intervals, scattered vertices, plates by gmsh.
 
 All are straight simplices, the same for every number of ranks. Knows nothing of bodies.
 """
@@ -7,7 +7,7 @@ All are straight simplices, the same for every number of ranks. Knows nothing of
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from enum import IntEnum
 from typing import Any
@@ -19,9 +19,15 @@ from dolfinx import mesh as dmesh
 from complexbody import _compat
 from complexbody._compat import Array, Ints
 from complexbody.errors import MeshError, MissingPackage, agree
+from complexbody.partition import balanced
 
-#: Facet tags: x = 0 and length, y = 0 and width, z = 0 and thickness, and the wall of the hole.
-Side = IntEnum("Side", "LEFT RIGHT BOTTOM TOP BACK FRONT HOLE")
+__all__ = [
+    "Side", "altitudes", "balanced", "box", "graded_interval", "interval", "jiggled",
+    "notched_plate", "perforated_plate", "rectangle",
+]  # fmt: skip
+
+#: Facet tags: x = 0 and length, y = 0 and width, z = 0 and thickness; walls of a hole or a notch.
+Side = IntEnum("Side", "LEFT RIGHT BOTTOM TOP BACK FRONT HOLE NOTCH")
 
 #: Delaunay: HXT makes another mesh every time. Optimiser: Netgen's takes three times as long.
 _GMSH = {
@@ -129,6 +135,59 @@ def perforated_plate(
             f"perforated_plate: no hole of radius {radius:g} at ({x:g}, {y:g}) with these sizes. "
             "Give positive numbers, size_at_hole ≤ size and a hole inside the plate."
         )
+    # In units of the length, for the tolerances of gmsh's geometry are absolute.
+    scaled = (given / length).reshape(3, 3).tolist()
+    return _by_gmsh(comm, lambda gmsh: _draw(gmsh, *scaled), length)
+
+
+def notched_plate(
+    comm: Any, length: float, width: float, notch: float, opening: float, size: float,
+    size_at_tip: float, thickness: float | None = None, growth: float = 0.25,
+) -> tuple[dmesh.Mesh, Any, Any]:  # fmt: skip
+    """Plate (0, length) × (0, width) with a sharp notch from the left, by gmsh.
+
+    The notch is a wedge along y = width/2, of the given opening at x = 0 and with its tip at
+    x = notch. Edges grow linearly with the distance from the tip.
+
+    Args:
+        comm: Communicator; rank 0 makes the mesh.
+        length: Of the plate, along x [m].
+        width: Along y.
+        notch: Length of the notch.
+        opening: Of the notch at the plate's edge; small for a slit.
+        size: Length of edges far from the tip [m].
+        size_at_tip: The same at the tip.
+        thickness: Along z, of a three-dimensional plate; None makes a mesh of triangles.
+        growth: Growth of the edges' length per distance from the tip; 0.1 to 0.3 is smooth.
+
+    Returns:
+        Mesh, cell tags (all 1) and facet tags (:data:`Side`).
+
+    Raises:
+        MeshError: if the notch is not inside the plate, or gmsh fails (on all ranks).
+        MissingPackage: if gmsh cannot be imported.
+    """
+    z = 1.0 if thickness is None else thickness
+    given = np.array([length, width, notch, opening, size, size_at_tip, z, growth])
+    inside = notch < length and opening < width and size_at_tip <= size
+    if not (np.all((given > 0) & np.isfinite(given)) and inside):
+        raise MeshError(
+            f"notched_plate: no notch of {notch:g} × {opening:g} in a plate of {length:g} × "
+            f"{width:g} with these sizes. Give positive numbers, size_at_tip ≤ size and a notch "
+            "inside the plate."
+        )
+    scaled, depth = given[1:6] / length, None if thickness is None else thickness / length
+
+    def draw(gmsh: Any) -> None:
+        _draw_notched(gmsh, scaled.tolist(), depth, growth)
+
+    return _by_gmsh(comm, draw, length, 2 if thickness is None else 3)
+
+
+def _by_gmsh(
+    comm: Any, draw: Callable[[Any], None], length: float, dim: int = 3
+) -> tuple[dmesh.Mesh, Any, Any]:
+    """Mesh, cell tags and facet tags of what ``draw`` makes on rank 0 in units of ``length``."""
     error: Exception | None = None
     with ExitStack() as stack:
         # gmsh changes what Ctrl-C does: 4.8 when it is imported, later ones when they start.
@@ -138,14 +197,13 @@ def perforated_plate(
 
             if comm.rank == 0:
                 _start(gmsh, stack)
-                # In units of the length, for the tolerances of gmsh's geometry are absolute.
-                _draw(gmsh, *(given / length).reshape(3, 3).tolist())
+                draw(gmsh)
         except (ImportError, OSError) as problem:  # the latter for a missing shared library
             error = MissingPackage(f"No gmsh: {problem}. Install it: apt install python3-gmsh.")
         except Exception as problem:  # gmsh raises nothing more special
             error = MeshError(f"gmsh cannot mesh this plate: {problem}. Try other sizes.")
         agree(comm, error)
-        mesh, cell_tags, facet_tags = _compat.mesh_from_gmsh(gmsh.model, comm)
+        mesh, cell_tags, facet_tags = _compat.mesh_from_gmsh(gmsh.model, comm, gdim=dim)
         mesh.geometry.x[:] *= length
         return mesh, cell_tags, facet_tags
 
@@ -156,19 +214,51 @@ def _draw(gmsh: Any, plate: Sequence[float], hole: Sequence[float], sizes: Seque
     solid, drill = occ.addBox(0, 0, 0, *plate), occ.addCylinder(x, y, 0, 0, 0, plate[2], radius)
     occ.cut([(3, solid)], [(3, drill)])
     occ.synchronize()
-    gmsh.model.addPhysicalGroup(3, [tag for _, tag in gmsh.model.getEntities(3)], 1)
-    for _, tag in gmsh.model.getEntities(2):
-        at = np.array(occ.getCenterOfMass(2, tag)) / plate  # the hole's is on its axis
+    _tag(gmsh, 3, plate, Side.HOLE)
+    distance = f"Sqrt((x-({x:.17g}))^2+(y-({y:.17g}))^2)-{radius:.17g}"
+    _grow(gmsh, distance, size, fine, growth)
+    gmsh.model.mesh.generate(3)
+
+
+def _draw_notched(gmsh: Any, lengths: Sequence[float], depth: float | None, growth: float) -> None:
+    """Geometry, tags, sizes and mesh of a notched plate of length 1 in gmsh's current model."""
+    width, notch, opening, size, fine = lengths
+    occ, y, half = gmsh.model.occ, width / 2, opening / 2
+    outline = [(0, 0), (1, 0), (1, width), (0, width), (0, y + half), (notch, y), (0, y - half)]
+    points = [occ.addPoint(*corner, 0) for corner in outline]
+    lines = [occ.addLine(p, q) for p, q in zip(points, points[1:] + points[:1], strict=True)]
+    face = occ.addPlaneSurface([occ.addCurveLoop(lines)])
+    if depth is not None:
+        occ.extrude([(2, face)], 0, 0, depth)
+    occ.synchronize()
+    _tag(gmsh, 2 if depth is None else 3, (1.0, width, depth or 1.0), Side.NOTCH)
+    _grow(gmsh, f"Sqrt((x-({notch:.17g}))^2+(y-({y:.17g}))^2)", size, fine, growth)
+    gmsh.model.mesh.generate(2 if depth is None else 3)
+
+
+def _tag(gmsh: Any, dim: int, plate: Sequence[float], other: Side) -> None:
+    """Physical groups: the body, the plate's sides, and all else that bounds it."""
+    gmsh.model.addPhysicalGroup(dim, [tag for _, tag in gmsh.model.getEntities(dim)], 1)
+    sides: dict[int, list[int]] = {}
+    for _, tag in gmsh.model.getEntities(dim - 1):
+        # The middle of a wall of hole or notch lies on no side.
+        at = np.array(gmsh.model.occ.getCenterOfMass(dim - 1, tag)[:dim]) / plate[:dim]
         planes = np.abs(np.stack([at, at - 1], axis=1).ravel()) < 1e-6
-        gmsh.model.addPhysicalGroup(2, [tag], planes.argmax() + 1 if planes.any() else Side.HOLE)
+        side = int(planes.argmax()) + 1 if planes.any() else int(other)
+        sides.setdefault(side, []).append(tag)
+    for side, tags in sides.items():
+        gmsh.model.addPhysicalGroup(dim - 1, tags, side)
+
+
+def _grow(gmsh: Any, distance: str, size: float, fine: float, growth: float) -> None:
+    """Edges of length ``fine`` at distance 0, growing to ``size``."""
     field = gmsh.model.mesh.field
-    distance, graded = field.add("MathEval"), field.add("Threshold")  # exact; "Distance" samples
-    field.setString(distance, "F", f"Sqrt((x-({x:.17g}))^2+(y-({y:.17g}))^2)-{radius:.17g}")
+    measured, graded = field.add("MathEval"), field.add("Threshold")  # exact; "Distance" samples
+    field.setString(measured, "F", distance)
     ends = {"SizeMin": fine, "SizeMax": size, "DistMin": 0.0, "DistMax": (size - fine) / growth}
-    for name, value in (("InField", distance), *ends.items()):
+    for name, value in (("InField", measured), *ends.items()):
         field.setNumber(graded, name, value)
     field.setAsBackgroundMesh(graded)
-    gmsh.model.mesh.generate(3)
 
 
 def _start(gmsh: Any, stack: ExitStack) -> None:

@@ -26,11 +26,13 @@ from complexbody.errors import OutputError, SceneError
 from complexbody.files import CsvWriter, Series, in_input_order, on_first_rank
 from complexbody.probes import Probes
 
-__all__ = ["CELL_FIELDS", "NODE_FIELDS", "CsvWriter", "Output", "Probes", "Writer"]
+__all__ = ["CELL_FIELDS", "NODE_FIELDS", "STEP_FIELDS", "CsvWriter", "Output", "Probes", "Writer"]
 
 NODE_FIELDS = ("u", "nu", "u_dot", "nu_dot")
 #: Fields per cell and the symbols they are stored under.
 CELL_FIELDS = {"stress": "P", "self_action": "z", "microstress": "S", "energy_density": "e"}
+#: Fields per cell that a run decides once, at its start.
+STEP_FIELDS = {"steps": "h", "levels": "level"}
 MOST_TIMES = 1_000_000
 
 
@@ -43,7 +45,8 @@ class Output:
         every: Time between outputs [s]. The start and the end are always written.
         times: Output times [s] instead of ``every``; those after the end are passed over.
         fields: Of "u", "nu", "u_dot", "nu_dot" (per node), "stress" P, "self_action" z,
-            "microstress" S and "energy_density" ρe (per cell, at its midpoint).
+            "microstress" S and "energy_density" ρe (per cell, at its midpoint); and, written once,
+            each cell's step "steps" h_K [s] and "levels", its octave below the longest.
         probes: Points by name, one coordinate per dimension of the mesh [m], whose fields go to a
             table.
         probe_steps: Rows of that table are this many steps apart.
@@ -67,7 +70,7 @@ class Output:
         object.__setattr__(self, "folder", Path(self.folder))
         object.__setattr__(self, "fields", tuple(dict.fromkeys(fields)))
         object.__setattr__(self, "times", tuple(np.atleast_1d(self.times)))
-        known = (*NODE_FIELDS, *CELL_FIELDS)
+        known = (*NODE_FIELDS, *CELL_FIELDS, *STEP_FIELDS)
         for name in self.fields:
             if name not in known:
                 raise OutputError(f"Output: field {name!r} is not known. Give {', '.join(known)}.")
@@ -129,16 +132,18 @@ class Writer:
     def __init__(self, action: Action, output: Output, resume: float | None = None) -> None:
         mesh, self._folder = action.scene.mesh, Path(output.folder)
         self._comm, self._nodes = mesh.comm, _compat.node_map(mesh).size_local
-        self._fields = output.fields
+        self._fields = tuple(name for name in output.fields if name not in STEP_FIELDS)
+        self._once = tuple(name for name in output.fields if name in STEP_FIELDS)
         self._derived = _Derived(action, [name for name in self._fields if name in CELL_FIELDS])
         (points, cells), self._order = in_input_order(mesh)
         self._series: dict[str, Series] = {}
 
         def start() -> None:
             self._folder.mkdir(parents=True, exist_ok=True)
-            for name in self._fields:
-                symbol = CELL_FIELDS.get(name, name)
-                center = "Cell" if name in CELL_FIELDS else "Node"
+            cellwise = {**CELL_FIELDS, **STEP_FIELDS}
+            for name in output.fields:
+                symbol = cellwise.get(name, name)
+                center = "Cell" if name in cellwise else "Node"
                 path = self._folder / name
                 self._series[name] = Series(path, symbol, center, points, cells, resume)
 
@@ -165,9 +170,28 @@ class Writer:
             if parts is not None:
                 values[name] = np.concatenate(parts)[self._order[name in derived]]
 
+        self._append(float(time), values)
+
+    def write_steps(self, steps: Mapping[str, Array]) -> None:
+        """Write those of "steps" and "levels" that were asked for, at t = 0; collective.
+
+        Args:
+            steps: By name, values of this rank's owned cells (cells,).
+
+        Raises:
+            OutputError: if rank 0 cannot write.
+        """
+        values: dict[str, Array] = {}
+        for name in self._once:
+            parts = self._comm.gather(np.asarray(steps[name])[:, None])
+            if parts is not None:
+                values[name] = np.concatenate(parts)[self._order[1]]
+        self._append(0.0, values)
+
+    def _append(self, time: float, values: Mapping[str, Array]) -> None:
         def append() -> None:
-            for name, series in self._series.items():
-                series.append(float(time), values[name])
+            for name, table in values.items():
+                self._series[name].append(time, table)
 
         on_first_rank(self._comm, self._folder, append, hdf5=True)
 

@@ -9,17 +9,22 @@ from __future__ import annotations
 
 import itertools
 import time
+import warnings
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.integrators.entries import Run
+from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps
+
+if TYPE_CHECKING:
+    from complexbody.simulate import Result
 
 Array = npt.NDArray[np.float64]
 
@@ -110,7 +115,7 @@ def _strains(keep: list[int], scale: Array, dim: int) -> Array:
     return left[:, rotations.shape[1] :]
 
 
-def seconds_per_step(run: SynchronousRun, comm: Any, budget: float = 0.3) -> float:
+def seconds_per_step(run: Run, comm: Any, budget: float = 0.3) -> float:
     """Wall time of one step of the slowest rank [s], by timing some; collective."""
     run.advance(2)
     count = 1
@@ -122,6 +127,35 @@ def seconds_per_step(run: SynchronousRun, comm: Any, budget: float = 0.3) -> flo
         if spent > budget / 3 or count >= 100_000:
             return float(spent / count)
         count *= 4
+
+
+def realised_speed_up(result: Result) -> float:
+    """Speed-up of a finished run over one step for all, in wall time of stepping; collective.
+
+    A run of the same scene by ``Synchronous`` is prepared, with its default step and the same
+    dissipation scheme, and some of its steps are timed here and now: on a machine that others use
+    the ratio is no better than the two times.
+
+    Returns:
+        Seconds of stepping per simulated second, of the synchronous run over those of this one.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the run has told them
+        problem = Problem(result.scene)
+    dissipation = getattr(result.integrator, "dissipation", "exact")
+    rate = synchronous_rate(problem, dissipation, result.time)
+    problem.close()
+    return rate * result.time / max(result.stats.stepping, 1e-12)
+
+
+def synchronous_rate(problem: Problem, dissipation: str, until: float) -> float:
+    """Wall time that ``Synchronous`` would take per simulated second, by timing some steps.
+
+    Collective. The problem is laid out anew: runs that were made from it are of no more use.
+    """
+    problem.arrange()
+    run = Synchronous(dissipation=dissipation).prepare(problem, until)
+    return seconds_per_step(run, problem.comm) / run.step
 
 
 def seconds_per_row(books: Bookkeeper, comm: Any) -> float:

@@ -69,6 +69,8 @@ class Problem:
         self.kernels = Kernels(self.action, disc)
         fixed = self.supports.fixed[disc.dof]
         self.masses = Masses(disc, fixed)
+        # Whatever integrator follows, kinetic energies are those of the whole Ω.
+        self.kernels.select(self.masses.diagonal, damped=False)
         rows, columns = np.nonzero(moving[disc.dof])
         self.moving = rows.astype(np.int64), columns.astype(np.int32)
         number = disc.number

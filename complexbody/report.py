@@ -17,6 +17,7 @@ import numpy as np
 
 from complexbody import __version__, ledger, machine
 from complexbody.body import Body
+from complexbody.integrators.timetable import TimeSets
 from complexbody.output import Output
 from complexbody.precheck import Limits
 from complexbody.scene import Scene
@@ -84,13 +85,34 @@ def _value(value: Any) -> str:
     return f"{float(array):.6g}" if array.ndim == 0 else str(array.tolist())
 
 
-def step(step: float, critical: float, until: float | None) -> str:
-    """Step, critical step and number of steps."""
+def step(run: Any, method: Any, until: float | None) -> str:
+    """Step of a run, critical step and number of steps; for local steps the longest one."""
+    step, critical = run.step, run.critical
+    count = "" if until is None else f"; {steps(step, until)} of them to t = {until:g} s"
+    if method.asynchronous:
+        name = "coarse step" if hasattr(method, "levels") else "window"
+        text = f"{name} {step:.6g} s, {step / critical:.3g} times the smallest cell's critical step"
+        return entry("step", f"{text} of {critical:.6g} s{count}")
     share = step / critical
-    text = f"{step:.6g} s, {share:.3g} of the critical {critical:.6g} s"
-    if until is not None:
-        text += f"; {steps(step, until)} of them to t = {until:g} s"
+    text = f"{step:.6g} s, {share:.3g} of the critical {critical:.6g} s{count}"
     return entry("step", text + (" (UNSTABLE)" if share > 1 + 1e-9 else ""))
+
+
+def time_sets(sets: TimeSets | None) -> list[str]:
+    """Time sets of an integrator with local steps, and what they should save; else nothing."""
+    if sets is None:
+        return []
+    first, *others = str(sets).splitlines()
+    return [entry("time sets", first), *(entry("", line) for line in others)]
+
+
+def speed_up(sets: TimeSets, realised: float) -> str:
+    """What local steps save in updates, and in time."""
+    return entry(
+        "speed-up",
+        f"over one step for all: {sets.ideal:.3g} ideal and {sets.scheduled:.3g} scheduled in cell "
+        f"updates, {realised:.3g} realised in time (some synchronous steps were timed)",
+    )
 
 
 def steps(step: float, until: float) -> int:
@@ -130,7 +152,8 @@ def before(job: Any, name: str, method: Any, plan: Output, until: float) -> list
         mesh(job.scene, s.cells, s.nodes, s.ranks),
         *bodies(job.scene),
         integrator(name, method),
-        step(s.step, s.critical, until),
+        step(job.run_, method, until),
+        *time_sets(job.run_.time_sets),
         memory(s.bytes_per_cell, s.cells),
         output(plan, until, job.every),
     ]
@@ -214,6 +237,11 @@ def _plain(value: Any) -> Any:
 
 
 def results(result: Result) -> dict[str, Any]:
-    """What run.json keeps of a finished run: statistics and the final ledger row."""
+    """What run.json keeps of a run: statistics, final ledger row, numbers of the time sets."""
     row = dict(zip(result.ledger.columns, result.ledger.rows[-1], strict=True))
-    return {"statistics": asdict(result.stats), "ledger": row}
+    out = {"statistics": asdict(result.stats), "ledger": row}
+    if result.time_sets is not None:
+        out["time_sets"] = {
+            name: value for name, value in vars(result.time_sets).items() if np.isscalar(value)
+        }
+    return out

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time as clock
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,9 @@ from complexbody.errors import SceneError
 from complexbody.files import CsvWriter
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
+from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
+from complexbody.integrators.timetable import TimeSets
 from complexbody.ledger import Bookkeeper, Ledger
 from complexbody.output import Output, Writer
 from complexbody.problem import Problem
@@ -69,6 +72,8 @@ class Result:
         probes: {name: {"time": (m,), "u": (m, n_u), "nu": (m, k)}} on rank 0, empty elsewhere.
         stats: What it cost.
         scene: What was simulated; folder: where output went, or None.
+        integrator: How.
+        time_sets: Who acted when, and what that saves; None where all cells act together.
     """
 
     u: fem.Function
@@ -81,11 +86,13 @@ class Result:
     scene: Scene
     probes: dict[str, dict[str, Array]] = field(default_factory=dict)
     folder: Path | None = None
+    integrator: Any = None
+    time_sets: TimeSets | None = None
 
 
 def simulate(
     scene: Scene,
-    integrator: Synchronous | AVI | None = None,
+    integrator: Synchronous | AVI | LocalLeapfrog | None = None,
     *,
     until: float,
     output: Output | None = None,
@@ -97,7 +104,8 @@ def simulate(
 
     Args:
         scene: What to simulate.
-        integrator: How; ``Synchronous()`` by default.
+        integrator: How; ``Synchronous()`` by default, or ``AVI`` or ``LocalLeapfrog`` where a few
+            small cells would dictate the step of all others.
         until: End of the run [s].
         output: What to write and where; nothing by default.
         ledger_steps: Steps between two ledger rows; by default so many that the books cost some
@@ -131,7 +139,7 @@ class Simulation:
     def __init__(
         self,
         scene: Scene,
-        integrator: Synchronous | AVI | None = None,
+        integrator: Synchronous | AVI | LocalLeapfrog | None = None,
         *,
         until: float,
         output: Output | None = None,
@@ -146,7 +154,7 @@ class Simulation:
             )
         if ledger_steps is not None and ledger_steps < 1:
             raise SceneError(f"simulate: ledger_steps is {ledger_steps}. Give 1 or more.")
-        method = integrator or Synchronous()
+        self.method = method = integrator or Synchronous()
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         require_constant_inertia(scene, type(method).__name__)
         self.problem = Problem(scene)
@@ -154,6 +162,8 @@ class Simulation:
         self.last = int(np.ceil(until / self.run_.step - 1e-9))
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
         self.writer = Writer(self.problem.action, output) if output is not None else None
+        if self.writer is not None:
+            self.writer.write_steps(self._steps())
         self.books = Bookkeeper(self.problem, self.run_, growth)
         self.times = output.schedule(until) if output is not None else np.zeros(0)
         start = self.problem.initial_fields, self.problem.initial_rates
@@ -172,6 +182,13 @@ class Simulation:
             self.stats.cells, self.comm.size, self.last
         )
         self.stats.set_up = clock.perf_counter() - begun
+
+    def _steps(self) -> dict[str, Array]:
+        """Step and level of each of this rank's cells."""
+        sets, count = self.run_.time_sets, self.problem.disc.count
+        if sets is None:
+            return {"steps": np.full(count, self.run_.step), "levels": np.zeros(count)}
+        return {"steps": sets.steps, "levels": sets.levels.astype(np.float64)}
 
     def _statistics(self) -> None:
         disc = self.problem.disc
@@ -219,7 +236,9 @@ class Simulation:
     def _advance(self, steps: int) -> None:
         begun = clock.perf_counter()
         # In pieces of about a second, so that progress and signals are seen in long stretches.
-        piece = max(1, 50_000_000 // max(self.stats.cells // self.comm.size, 1))
+        sets = self.run_.time_sets
+        updates = self.stats.cells if sets is None else sets.updates
+        piece = max(1, 50_000_000 // max(updates // self.comm.size, 1))
         while steps > 0:
             self.run_.advance(min(piece, steps))
             steps -= piece
@@ -278,7 +297,10 @@ class Simulation:
         folder = Path(self.output.folder) if self.output is not None else None
         probes = self.receivers.table() if self.receivers is not None else {}
         fields = (f["u"], f["nu"], f["u_dot"], f["nu_dot"])
-        return Result(*fields, self.until, self.books.ledger, s, self.scene, probes, folder)
+        return Result(
+            *fields, self.until, self.books.ledger, s, self.scene, probes, folder, self.method,
+            self.run_.time_sets,
+        )  # fmt: skip
 
     # --- what leaves the run -------------------------------------------------------------------
 
@@ -298,6 +320,10 @@ class Simulation:
         self.stats.writing += clock.perf_counter() - begun
 
     def _book(self) -> None:
+        # The forces at this time are the next step's as well: they are no cost of the books.
+        begun = clock.perf_counter()
+        self.run_.sample()
+        self.stats.stepping += clock.perf_counter() - begun
         begun = clock.perf_counter()
         rows = len(self.books.ledger)
         try:
@@ -316,6 +342,7 @@ class Simulation:
         for thing in (self.writer, self.csv, self.receivers):
             if thing is not None:
                 thing.close()
+        self.run_.close()
         self.problem.close()
 
 

@@ -49,12 +49,26 @@ def picture(result, path):
     if result.u.function_space.mesh.comm.rank == 0:
         path.write_text("drawn")
 """
+LEAPFROG = ("--integrator", "local-leapfrog")
+#: A bar whose last cell is a 32nd of the others.
+GRADED = """
+def scene(comm):
+    return cb.Scene(
+        meshes.graded_interval(comm, [1 / 16] * 16 + [1 / 512]),
+        isotropic_two_field(d=1, name="rubber"),
+        supports=[cb.Fix("u", where=lambda x: x[0] < 1e-9)],
+        initial=cb.Initial(u=lambda x: np.sin(np.pi * x[:1])),
+        name="graded bar",
+    )
+"""
+_BOTH = (
+    "--set --until --integrator --step --safety --dissipation --start --critical --unstable-ok "
+    "--balanced --stabilisation --levels --debug"
+)
 OPTIONS = {
-    "run": "--set --until --integrator --step --safety --dissipation --start --critical "
-    "--unstable-ok --out --every --fields --probe --probe-steps --ledger-steps --no-picture "
-    "--quiet --debug",
-    "check": "--set --until --integrator --step --safety --dissipation --start --critical "
-    "--unstable-ok --debug",
+    "run": f"{_BOTH} --out --every --fields --probe --probe-steps --ledger-steps --no-picture "
+    "--speed-up --quiet",
+    "check": _BOTH,
     "info": "--debug",
 }
 
@@ -207,6 +221,10 @@ def test_quiet_prints_nothing(bar, call, shared_path):
         (("--integrator", "synchronous", "--step", "1e-3"), {"step": 1e-3}),
         (("--dissipation", "forward", "--critical", "cells"), {"dissipation": "forward"}),
         (("--unstable-ok",), {"unstable_ok": True}),
+        (
+            ("--integrator", "local-leapfrog", "--stabilisation", "0.1", "--levels", "2"),
+            {"integrator": "local-leapfrog", "stabilisation": 0.1, "levels": 2},
+        ),
     ],
 )
 def test_options_go_before_defaults(bar, words, settings):
@@ -228,6 +246,33 @@ def test_ledger_rows_and_fields_are_those_asked_for(bar, call, comm, shared_path
     assert call("run", bar(), *words)[0] == 0
     assert len(_table(out / "ledger.csv")[1]) == 5
     assert not list(out.glob("*.h5"))
+
+
+@pytest.mark.parametrize("integrator", ["avi", "local-leapfrog"])
+def test_local_steps(bar, call, comm, shared_path, integrator):
+    """check and run say the same of a step above the critical one, and do not call it unstable."""
+    path, out = bar(GRADED), shared_path / "out"
+    code, checked, err = call("check", path, "--integrator", integrator)
+    assert (code, err) == (0, "")
+    assert "speed-up over one step for all: 11.3 ideal" in flat(checked)
+    code, text, err = call("run", path, "--integrator", integrator, "--out", out, "--speed-up")
+    assert (code, err) == (0, "")
+    assert "speed-up over one step for all: 11.3 ideal" in flat(text)
+    told = [line for line in text.splitlines() if line.startswith("  time sets   steps ")]
+    assert len(told) == 1 and told[0] in checked
+    name = {"avi": "window", "local-leapfrog": "coarse step"}[integrator]
+    told = [line for line in text.splitlines() if line.startswith(f"  step        {name} ")]
+    assert len(told) == 1 and told[0] in checked
+    assert "times the smallest cell's critical step of 0.001" in flat(text)
+    assert "UNSTABLE" not in checked + text
+    found = record(out)
+    assert found["settings"]["integrator"] == integrator
+    assert found["statistics"]["step"] > 3 * found["statistics"]["critical"]
+    assert found["time_sets"]["cells"] == 17
+    assert found["time_sets"]["window"] == found["statistics"]["step"]
+    # A 17th of the cells steps 32 times as often.
+    alone = 17 * found["settings"]["until"] / (0.9 * found["statistics"]["critical"])
+    assert found["statistics"]["updates"] < 0.6 * alone
 
 
 # --- errors ------------------------------------------------------------------------------------
@@ -261,6 +306,10 @@ def test_ledger_rows_and_fields_are_those_asked_for(bar, call, comm, shared_path
         (("check", "nowhere.py"), 2, "nowhere.py cannot be read"),
         (("check", "FILE", "--step", "1"), 2, "larger than the critical step"),
         (("check", "FILE", "--set", "cells=-3"), 2, "in scene()"),
+        (("run", "FILE", "--levels", "2"), 2, "Integrator synchronous has no option levels"),
+        (("run", "FILE", *LEAPFROG, "--levels", "-1"), 2, "levels is -1. Give 0 to 20"),
+        (("run", "FILE", *LEAPFROG, "--stabilisation", "-1"), 2, "stabilisation is -1.0. Give"),
+        (("check", "FILE", *LEAPFROG, "--filter", "0"), 2, "has no option filter. It has"),
     ],
 )
 def test_errors(bar, call, shared_path, words, code, message):

@@ -19,6 +19,16 @@ SMALL = [
         ("--set", "refine=0.5", "--until", "2.4e-6", "--every", "1.2e-6"),
         "first pulse at",
     ),
+    (
+        "graded_crack.py",
+        ("--set", "refine=0.3", "--set", "grading=75", "--until", "0.6"),
+        "local leapfrog",
+    ),
+    (
+        "graded_crack.py",
+        ("--set", "dim=3", "--set", "refine=0.2", "--set", "grading=75", "--until", "0.5"),
+        "local leapfrog",
+    ),
 ]
 
 

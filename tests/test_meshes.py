@@ -123,7 +123,7 @@ def test_plate_has_its_volume_and_sides(plate):
         Side.FRONT: LENGTH * WIDTH - hole,
         Side.HOLE: 2 * np.pi * RADIUS * THICKNESS,
     }
-    assert list(areas) == list(Side)
+    assert list(areas) == [side for side in Side if side != Side.NOTCH]
     for side, area in areas.items():
         assert integral(mesh, ds(int(side))) == pytest.approx(area, rel=2e-3), side
 
@@ -135,7 +135,8 @@ def test_sides_of_the_plate_lie_where_their_names_say(plate):
     planes = (x[0], x[0] - LENGTH, x[1], x[1] - WIDTH, x[2], x[2] - THICKNESS)
     away = (*planes, radius - RADIUS)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=facet_tags)
-    for side, distance in zip(Side, away, strict=True):
+    sides = [side for side in Side if side != Side.NOTCH]
+    for side, distance in zip(sides, away, strict=True):
         form = _compat.form(abs(distance) * ds(int(side)))
         mean = mesh.comm.allreduce(fem.assemble_scalar(form))
         # Chords of the circle lie inside by up to (their length)²/8 of the radius.
@@ -198,6 +199,48 @@ def test_impossible_plates_are_refused(comm, changes):
     names = ("length", "width", "thickness", "radius", "size", "size_at_hole", "centre")
     with pytest.raises(MeshError, match="perforated_plate: no hole"):
         meshes.perforated_plate(comm, **{**dict(zip(names, SMALL, strict=True)), **changes})
+
+
+NOTCHED = {"length": 3.0, "width": 1.2, "notch": 1.1, "opening": 0.03, "size": 0.12,
+           "size_at_tip": 0.12 / 80}  # fmt: skip
+
+
+@pytest.mark.parametrize("thickness", [None, 0.1])
+def test_notched_plate(comm, thickness):
+    """Volume, sides with their lengths, and cells that grow from the tip by a factor over 64."""
+    fine = {} if thickness is None else {"size": 0.2, "size_at_tip": 0.2 / 70}
+    given = {**NOTCHED, **fine}
+    mesh, cells, facets = meshes.notched_plate(comm, **given, thickness=thickness, growth=0.3)
+    deep = 1.0 if thickness is None else thickness
+    area = 3.0 * 1.2 - 0.5 * 0.03 * 1.1
+    assert integral(mesh, ufl.dx(domain=mesh)) == pytest.approx(area * deep)
+    assert np.all(cells.values == 1)
+    ds = ufl.ds(domain=mesh, subdomain_data=facets)
+    face = np.hypot(1.1, 0.015)
+    expected = {Side.LEFT: 1.17, Side.RIGHT: 1.2, Side.BOTTOM: 3.0, Side.TOP: 3.0,
+                Side.NOTCH: 2 * face}  # fmt: skip
+    for side, length in expected.items():
+        assert integral(mesh, ds(int(side))) == pytest.approx(length * deep), side
+    if thickness is not None:
+        for side in (Side.BACK, Side.FRONT):
+            assert integral(mesh, ds(int(side))) == pytest.approx(area)
+    sizes = everywhere(mesh, meshes.altitudes(mesh))
+    assert sizes.max() / sizes.min() > 64
+    owned = _compat.cell_nodes(mesh)[: _compat.cell_count(mesh)[0]]
+    middle = everywhere(mesh, mesh.geometry.x[owned].mean(axis=1))
+    distance = np.hypot(middle[:, 0] - 1.1, middle[:, 1] - 0.6)
+    wanted = np.minimum(given["size_at_tip"] + 0.3 * distance, given["size"])
+    near = np.sort(sizes / wanted)  # an equilateral triangle's altitude is 0.87 of its edge
+    assert np.median(near) == pytest.approx(0.75, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"notch": 3.5}, {"opening": 2.0}, {"size_at_tip": 0.5}, {"width": -1.0},
+                {"thickness": 0.0}, {"growth": np.nan}],
+)  # fmt: skip
+def test_impossible_notches_are_refused(comm, changes):
+    with pytest.raises(MeshError, match="notched_plate: no notch"):
+        meshes.notched_plate(comm, **{**NOTCHED, **changes})
 
 
 def test_missing_gmsh_is_told_on_all_ranks(comm, monkeypatch):

@@ -14,10 +14,13 @@ import ufl
 from busy import LEFT, RIGHT, busy
 from dense import prepared, quadratic, random_hessian, slopes
 from harness import everywhere, largest, refused
+from mpi4py import MPI
 
 import complexbody as cb
 from complexbody import _compat, meshes
 from complexbody.errors import IntegratorError, OutputError, SceneError, StepError
+from complexbody.forms import isotropic_two_field
+from complexbody.halo import Halo
 from complexbody.simulate import hermite
 
 STIFF, OWN, CELLS = 1.0, 0.4, 10
@@ -266,6 +269,41 @@ def test_scene_is_as_it_was(comm):
     cb.simulate(scene, cb.Synchronous(dissipation="forward"), until=0.1)
     again = cb.simulate(scene, until=0.2)
     assert everywhere(comm, np.array_equal(first.nu.x.array, again.nu.x.array))
+
+
+# --- local steps ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", [cb.AVI(), cb.AVI(balanced=False), cb.LocalLeapfrog()])
+def test_local_steps(comm, shared_path, method, monkeypatch):
+    """Integrators with local steps give results like the others, and free their communicators."""
+    halos, made = [], Halo.__init__
+
+    def noted(self, *given):
+        made(self, *given)
+        halos.append(self)
+
+    monkeypatch.setattr(Halo, "__init__", noted)
+    body, mesh = isotropic_two_field(d=2), meshes.rectangle(comm, (0, 0), (1, 1), 8)
+    mesh.geometry.x[:, 0] = mesh.geometry.x[:, 0] ** 3
+    shape = cb.Initial(u=lambda x: np.cos(np.pi * x[:2]))
+    scene, results = cb.Scene(mesh, body, initial=shape), []
+    for each in (cb.Synchronous(safety=0.1), method):
+        halos.clear()
+        output = cb.Output(shared_path / type(each).__name__, every=0.03)
+        results.append(cb.simulate(scene, each, until=0.1, output=output))
+        if comm.size > 1:
+            assert halos and all(halo.comm == MPI.COMM_NULL for halo in halos)
+    exact, found = results
+    assert found.stats.step > 2 * found.stats.critical and found.time == 0.1
+    assert 0 < found.stats.updates < 0.25 * exact.stats.updates
+    scale = largest(comm, exact.u.x.array)
+    assert largest(comm, found.u.x.array - exact.u.x.array) < 0.05 * scale
+    comm.barrier()
+    folders = [shared_path / type(each).__name__ for each in (cb.Synchronous(), method)]
+    (times, _, expected), (same, _, values) = (written(folder, "u") for folder in folders)
+    np.testing.assert_array_equal(times, same)
+    assert abs(values - expected).max() < 0.05 * scale
 
 
 # --- refusals -------------------------------------------------------------------------------------

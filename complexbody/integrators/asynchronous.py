@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from complexbody.errors import IntegratorError, StepError, agree
 from complexbody.integrators.exact_run import ExactRun
-from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.exact_schedule import span_length
+from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions, graded, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
@@ -92,18 +92,35 @@ class AVI:
         if self.corrected is None:
             object.__setattr__(self, "corrected", exact)
         for wrong, advice in (
-            (exact and self.balanced, "schedule='exact' has no windows to balance. Use balanced=False"),
-            (not octaves and self.balanced, "balanced windows are stable only where neighbours differ by two. Use schedule='octaves'"),
-            (whole and self.balanced, "balanced windows start from the force half a step on. Use balanced=False, or start='trapezoidal'"),
-            (not exact and self.corrected, "corrected is for cells that act alone. Use schedule='exact'"),
-            (not exact and self.steps is not None, "steps are for schedule='exact'. Use that, or safety"),
-        ):  # fmt: skip
+            (
+                exact and self.balanced,
+                "schedule='exact' has no windows to balance. Use balanced=False",
+            ),
+            (
+                not octaves and self.balanced,
+                "balanced windows are stable only where neighbours' steps differ by two at most. "
+                "Use schedule='octaves'",
+            ),
+            (
+                whole and self.balanced,
+                "balanced windows start from the force half a step on. Use balanced=False, or "
+                "start='trapezoidal'",
+            ),
+            (
+                not exact and self.corrected,
+                "corrected is for cells that act alone. Use schedule='exact'",
+            ),
+            (
+                not exact and self.steps is not None,
+                "steps are for schedule='exact'. Use that, or safety",
+            ),
+        ):
             if wrong:
                 raise IntegratorError(f"AVI: {advice}.")
 
     @classmethod
     def as_published(cls, safety: float = 0.45, steps: Array | None = None) -> AVI:
-        """The paper's scheme: real steps, one-sided start, dissipation (dissdiscr), its sign corrected."""
+        """The paper's scheme: real steps, one-sided start, (dissdiscr) with its sign corrected."""
         return cls(
             safety, "exact", dissipation="forward", start="one-sided", corrected=False, steps=steps
         )

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody import native
+from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
@@ -84,6 +85,10 @@ class Run(Protocol):
     def time(self) -> float:
         """Time reached [s]."""
 
+    @property
+    def time_sets(self) -> TimeSets | None:
+        """Who acts when; None where all cells act together."""
+
     def advance(self, steps: int) -> None:
         """Do some steps."""
 
@@ -95,6 +100,9 @@ class Run(Protocol):
 
     def entries(self) -> Entries:
         """The books at the time reached, this rank's share."""
+
+    def close(self) -> None:
+        """Free communicators of the run's own."""
 
 
 def half_quadratic(problem: Problem, matrix: Array, w: Array, first: int, last: int) -> float:

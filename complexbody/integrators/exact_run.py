@@ -17,6 +17,7 @@ import numpy.typing as npt
 from complexbody import native
 from complexbody.integrators.exact_schedule import ExactSchedule
 from complexbody.integrators.records import RecordRun, World
+from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ class ExactRun(RecordRun):
         disc, self.steps_of = problem.disc, steps
         trapezoidal = method.start == "trapezoidal"
         self.schedule = ExactSchedule(problem, steps, span, trapezoidal)
+        own = per_cell(disc, steps)
+        self.time_sets = time_sets(disc, own, critical, span)
         self._ahead = ctypes.byref(self.schedule.state)
         # Kicks of shared nodes are applied one by one, not collected.
         self.world.late = self.world.beyond = 0

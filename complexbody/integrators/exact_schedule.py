@@ -50,8 +50,8 @@ class Schedule(ctypes.Structure):
         ("cells", ctypes.c_int64), ("visits", ctypes.c_int64),
         *(
             (name, ctypes.c_void_p)
-            for name in ("packed", "node", "region", "step", "counter", "actor", "index", "row", "row_node",
-                         "list", "event", "link", "last", "stack", "bucket")
+            for name in ("packed", "node", "region", "step", "counter", "actor", "index", "row",
+                         "row_node", "list", "event", "link", "last", "stack", "bucket")
         ),
         ("buckets", ctypes.c_int64),
         *(
@@ -59,7 +59,10 @@ class Schedule(ctypes.Structure):
             for name in ("head", "tail", "kicks", "rows_of", "rows", "row_neighbour", "row_place",
                          "outgoing", "out_start", "out_count")
         ),
-        *((name, ctypes.c_int64) for name in ("first_shared", "last_shared", "events", "top", "done")),
+        *(
+            (name, ctypes.c_int64)
+            for name in ("first_shared", "last_shared", "events", "top", "done")
+        ),
         ("trapezoidal", ctypes.c_int32),
     )  # fmt: skip
 
@@ -80,7 +83,7 @@ class ExactSchedule:
     """
 
     def __init__(self, problem: Problem, steps: Array, span: float, trapezoidal: bool) -> None:
-        disc, kernels = problem.disc, problem.kernels
+        disc = problem.disc
         self.halo, self.comm, self.n = disc.halo, problem.comm, disc.n
         cells = disc.blocks * disc.lanes
         original = _compat.original_cells(problem.scene.mesh)
@@ -139,14 +142,15 @@ class ExactSchedule:
             setattr(state, name, native.pointer(array).value)
         state.buckets, state.trapezoidal = buckets, int(trapezoidal)
         state.first_shared, state.last_shared = disc.late, disc.late + disc.shared
+        self._from = visits["from"]
+        most = np.ceil(span / visits["step"]) + 1
         self._incoming = [
-            np.zeros((int(np.sum(np.ceil(span / visits["step"][visits["from"] == i]) + 1)), 1 + self.n))
+            np.zeros((int(most[self._from == i].sum()), 1 + self.n))
             for i in range(len(self.halo.neighbours))
         ]
-        self._from = visits["from"]
 
     def _visits(self, disc: Any, steps: Array, number: Ints) -> dict[str, Any]:
-        """Visits that other ranks' cells will make to this rank's nodes: step, number, row, from."""
+        """Visits by other ranks' cells to this rank's nodes: step, number, row, from."""
         halo, comm = disc.halo, disc.comm
         self._sizes = np.zeros(len(halo.neighbours), np.int64)
         rows_of: list[dict[int, int]] = []
@@ -207,7 +211,7 @@ class ExactSchedule:
     # --- a span ------------------------------------------------------------------------------
 
     def run(self, c: Any, world: Any, start: float, end: float) -> int:
-        """Do all events with start ≤ t < end; collective. Returns how many cells of this rank did."""
+        """Do all events with start ≤ t < end; collective: how many are of this rank's cells."""
         state, ahead = self.state, ctypes.byref(self.state)
         j0 = self.counter.copy() if len(self._from) else self.counter
         rows = ctypes.c_int64(len(self.halo.sends))

@@ -47,6 +47,7 @@ from complexbody.integrators import octaves
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
@@ -161,6 +162,8 @@ class LocalLeapfrogRun(SynchronousRun):
 
     Attributes:
         plan: Steps and levels; levels: number of octaves below the coarse step.
+        time_sets: Who acts when, substeps counted as equal parts of the step: with the filter they
+            are a little longer, and only the step's end has a time.
         per_step: Cell updates of this rank per step.
         critical: Critical step of the smallest cell, that of a synchronous run [s].
     """
@@ -171,6 +174,8 @@ class LocalLeapfrogRun(SynchronousRun):
         disc, self.plan, self.levels = problem.disc, plan, plan.depth
         real = (disc.source_cell >= 0).sum(axis=1)
         self.per_step = int(np.sum(real * 2**disc.group)) if self.levels else disc.count
+        count = per_cell(disc, 2 ** disc.group[:, None])  # one group at first: number 0
+        self.time_sets = time_sets(disc, plan.step / count, plan.cells, plan.step, count)
         self._driven = problem.comm.allreduce(len(problem.moving[0])) > 0
         self._loaded = problem.comm.allreduce(len(problem.load_value)) > 0
         self._messages: list[octaves.Message] = []

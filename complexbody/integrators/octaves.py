@@ -27,6 +27,7 @@ from mpi4py import MPI
 from complexbody import _compat, native
 from complexbody.errors import StepError
 from complexbody.halo import Halo, sharing
+from complexbody.integrators.timetable import per_cell
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps
 
@@ -47,12 +48,14 @@ class Plan:
         step: Coarse step Δt [s]; critical: synchronous critical step of the smallest cell [s].
         level: Level of every geometry node of this rank (dolfinx's numbers).
         depth: The largest level on any rank.
+        cells: Critical step of each of this rank's cells, in dolfinx's order [s].
     """
 
     step: float
     critical: float
     level: Ints
     depth: int
+    cells: Array
 
 
 def plan(
@@ -113,12 +116,13 @@ def plan(
     level = np.minimum(_levels(bins / BINS + above, ratio), depth)
     out = np.zeros(_compat.node_count(problem.scene.mesh), np.int64)
     out[disc.dof] = level
+    own = per_cell(disc, cells)
     if depth > 0:
         real = disc.source_cell >= 0
         finest = np.zeros(disc.count, np.int64)
         finest[disc.source_cell[real]] = _finest(problem, level)
         problem.arrange(finest)
-    return Plan(float(step), smallest, out, depth)
+    return Plan(float(step), smallest, out, depth, own)
 
 
 def _bins(steps: Array, longest: float) -> Ints:

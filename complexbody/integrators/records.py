@@ -17,6 +17,7 @@ from mpi4py import MPI
 
 from complexbody import native
 from complexbody.integrators.entries import Entries, energies
+from complexbody.integrators.timetable import TimeSets
 from complexbody.kernels import events
 from complexbody.problem import Problem
 
@@ -60,7 +61,10 @@ class RecordRun:
         critical: Critical step of the smallest cell [s], that of a synchronous run.
         updates: Cell updates (forces) done by this rank.
         record: Node records (nodes + 1, doubles per node); the last one is padding.
+        time_sets: Who acts when: what the paper calls Θ, with speed-ups.
     """
+
+    time_sets: TimeSets
 
     record: Array
     inverse_mass: Array
@@ -114,7 +118,7 @@ class RecordRun:
         world.forms = ctypes.addressof(self._forms.records)
         self._world = ctypes.byref(world)
 
-    def _point(self, **arrays: Array) -> None:
+    def _point(self, **arrays: npt.NDArray[Any]) -> None:
         """Hand arrays, which the run keeps, to the C side."""
         for name, array in arrays.items():
             setattr(self.world, name, array.ctypes.data)
@@ -124,7 +128,7 @@ class RecordRun:
         problem, method = self.problem, self.method
         disc, masses = problem.disc, problem.masses
         n, record = disc.n, disc.record
-        size, self._time, self._inverse = events.record_size(n, record, method.balanced)
+        size, self._time, self._inverse = events.record_size(n, record, bool(method.balanced))
         self.record = native.aligned((disc.nodes + 1, size))
         self.record[:-1, :n] = problem.initial_fields
         self.record[:-1, self._inverse] = 1.0 / disc.volume
@@ -154,6 +158,11 @@ class RecordRun:
     def time(self) -> float:
         """End of the last beat [s], from the counter."""
         return self.steps * self.step
+
+    def close(self) -> None:
+        """Free the run's own communicator; collective."""
+        if self.halo is not self.problem.disc.halo:
+            self.halo.close()
 
     # --- supports and loads ------------------------------------------------------------------
 
@@ -251,7 +260,7 @@ class RecordRun:
 
     def sample(self) -> tuple[Array, Array]:
         """(u, ν) and rates at the last beat's end, node records (nodes + 1, NR)."""
-        problem, kernels, n = self.problem, self.problem.kernels, self.problem.disc.n
+        kernels, n = self.problem.kernels, self.problem.disc.n
         kernels.x[:, :n] = self.record[:, :n]
         self.c.cb_get_rates(self._world, native.pointer(self._rates))
         if self._inert:

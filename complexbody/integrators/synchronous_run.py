@@ -18,6 +18,7 @@ from complexbody import native
 from complexbody.errors import IntegratorError
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.synchronous_books import entries
+from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -32,8 +33,11 @@ class SynchronousRun:
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
         updates: Cell updates done by this rank.
+        time_sets: None: all act together.
         support_work: Work of this rank's moving supports in the half step before a sample [J].
     """
+
+    time_sets: TimeSets | None = None
 
     def __init__(self, problem: Problem, method: Synchronous, step: float, critical: float) -> None:
         self.problem, self.method, self.step, self.critical = problem, method, step, critical
@@ -287,3 +291,6 @@ class SynchronousRun:
     def entries(self) -> Entries:
         """Energies and works at t_n, and the discrete energy of the last half step; collective."""
         return entries(self)
+
+    def close(self) -> None:
+        """Do nothing: messages are the problem's."""

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from complexbody.integrators.balance import Balance
 from complexbody.integrators.records import RecordRun
-from complexbody.integrators.windows import WindowPlan, time_sets
+from complexbody.integrators.timetable import per_cell, time_sets
+from complexbody.integrators.windows import WindowPlan
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -31,7 +32,12 @@ class WindowRun(RecordRun):
     def __init__(self, problem: Problem, method: AVI, window: float, critical: Array) -> None:
         super().__init__(problem, method, window, critical)
         self.plan = WindowPlan(problem.disc, window)
-        self.time_sets = time_sets(self.plan, problem.disc, critical, window)
+        count = per_cell(problem.disc, problem.disc.group[:, None])
+        # Half kicks at both ends are one force more than events.
+        ends = int(method.start == "trapezoidal")
+        self.time_sets = time_sets(
+            problem.disc, window / count, critical, window, count, ends=ends
+        )
         self.world.groups = ctypes.addressof(self.plan.groups)
         self._point(touched=self.plan.touched, touched_from=self.plan.touched_from)
         self.balance = Balance(self, self.plan) if method.balanced else None

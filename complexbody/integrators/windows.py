@@ -99,31 +99,6 @@ def graded(problem: Problem, counts: Ints) -> Ints:
     return out
 
 
-@dataclass(frozen=True)
-class TimeSets:
-    """The time sets Θ of a run over one window, of the whole body (paper §4, (MTeta)).
-
-    Attributes:
-        steps: h_K of this rank's cells [s], in the order of dolfinx's owned cells.
-        largest_step: T_Θ, the largest step of any cell [s].
-        size: h_Θ, the largest gap between two times of Θ = ∪Θ_K [s].
-        asynchronicity: τ_Θ, largest over smallest step.
-        events: Events of all cells per window; window: its length [s].
-        ideal: Speed-up over one step for all, in updates, if every cell took its own critical step.
-        scheduled: The same with the steps of this run, against a synchronous run at 0.9 of the
-            critical step.
-    """
-
-    steps: Array
-    largest_step: float
-    size: float
-    asynchronicity: float
-    events: int
-    window: float
-    ideal: float
-    scheduled: float
-
-
 @dataclass
 class Cut:
     """A time at which ranks exchange kicks: after the shared-node events [first, shared).
@@ -223,7 +198,7 @@ class WindowPlan:
 
 
 def _touched(disc: Discretisation, divisions: list[int]) -> npt.NDArray[np.bool_]:
-    """Shared nodes that cells of N_K equal to each of ``divisions`` touch on any rank; collective."""
+    """Shared nodes that cells of each N_K touch on any rank, (nodes, divisions); collective."""
     flags = np.zeros((disc.nodes + 1, len(divisions)))
     for block in range(disc.boundary_blocks):
         flags[disc.cells[block].ravel(), divisions.index(int(disc.group[block]))] = 1.0
@@ -239,31 +214,3 @@ def window_length(steps: Array, until: float, comm: Any) -> float:
         raise StepError("No cell has a finite critical step: the body has no stiffness.")
     largest = min(largest, until)
     return float(until / np.ceil(until / largest * (1 - 1e-12)))
-
-
-def time_sets(plan: WindowPlan, disc: Discretisation, critical: Array, window: float) -> TimeSets:
-    """Time sets of a window plan; collective.
-
-    Args:
-        plan: The plan.
-        disc: Its arrays.
-        critical: Critical steps of this rank's cells (cells,) [s].
-        window: W [s].
-    """
-    comm = disc.comm
-    real = disc.source_cell >= 0
-    steps = np.zeros(disc.count)
-    steps[disc.source_cell[real]] = np.broadcast_to(window / disc.group[:, None], real.shape)[real]
-    most = comm.allreduce(float(steps.max(initial=0.0)), op=MPI.MAX)
-    least = comm.allreduce(float(steps.min(initial=np.inf)), op=MPI.MIN)
-    every = set().union(*comm.allgather({int(n) for n in np.unique(disc.group)}))
-    times = np.unique(np.concatenate([[0.0, 1.0], *(np.arange(n + 1) / n for n in every)]))
-    cells, events = comm.allreduce(disc.count), comm.allreduce(plan.updates)
-    finite = np.where(np.isfinite(critical), critical, np.inf)
-    smallest = comm.allreduce(float(finite.min(initial=np.inf)), op=MPI.MIN)
-    rate = comm.allreduce(float(np.sum(1.0 / finite)))
-    return TimeSets(
-        steps=steps, largest_step=most, size=float(np.diff(times).max()) * window,
-        asynchronicity=most / least, events=events, window=window,
-        ideal=cells / smallest / rate, scheduled=cells * window / (0.9 * smallest) / events,
-    )  # fmt: skip

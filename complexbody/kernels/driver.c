@@ -27,6 +27,7 @@ typedef struct {
   double *sums;                   /* dissipated, variation of u_dot, of nu_dot */
   const double *coordinates;      /* [node][3], for tabulated kernels */
   const uint8_t *counted;         /* 1 where this rank counts the node in sums, [node] */
+  const tabulated *forms;         /* [region]{force, stored, potential energy}, where FFCx made them */
 } state;
 
 #define VN (NR < 8 ? NR : 8) /* components of one node vector */

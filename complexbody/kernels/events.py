@@ -69,7 +69,7 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
         "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1, "COEFFICIENTS": coefficients,
         "BALANCED": int(bool(method.balanced)), "DAMPED": int(damped),
         "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
-        "CORRECTED": int(method.corrected), "PACKED": packed_size(kernels),
+        "CORRECTED": int(bool(method.corrected)), "PACKED": packed_size(kernels),
         "CHUNK": CHUNK,
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]

@@ -37,6 +37,7 @@ class State(ctypes.Structure):
             for name in (
                 "table", "cell", "geometry", "coefficient", "x", "v", "f", "constant", "volume",
                 "inverse_volume", "klass", "alpha", "beta", "eta", "sums", "coordinates", "counted",
+                "forms",
             )
         ),
     )  # fmt: skip
@@ -128,6 +129,8 @@ class Kernels:
             ("sums", self.sums), ("coordinates", disc.position), ("counted", disc.owned),
         ):  # fmt: skip
             setattr(s, name, array.ctypes.data)
+        # Libraries are shared by all scenes of one source: nothing of a scene may be kept in them.
+        s.forms = ctypes.addressof(self._records)
         self.n, self.record = n, record
         self._libraries: dict[tuple[bool, bool], ctypes.CDLL] = {}
         self.select(diagonal=True, damped=False)
@@ -142,7 +145,6 @@ class Kernels:
             library.cb_quadratic.restype = ctypes.c_double
             library.cb_move.restype = ctypes.c_double
             library.cb_force_before.restype = ctypes.c_double
-            library.cb_set_tabulated(ctypes.byref(self._records))
             self._libraries[key] = library
         self.c = self._libraries[key]
 
@@ -157,8 +159,6 @@ class Kernels:
         }  # fmt: skip
         parts = [f"#define {k} {v}" for k, v in defines.items()]
         parts += [native.template("vectors.h"), native.template("tabulated.h")]
-        parts.append("static tabulated *cb_tabulated;\n"
-                     "void cb_set_tabulated(tabulated *t) { cb_tabulated = t; }")  # fmt: skip
         force, energy = [], []
         for r, generated in enumerate(d.generated):
             if generated:
@@ -174,11 +174,11 @@ class Kernels:
             else:
                 common = "s->nodes, blocks, first, c, s->x, s->coordinates"
                 force.append(
-                    f"case {r}: tabulated_force(cb_tabulated + {3 * r}, {common}, s->f); break;"
+                    f"case {r}: tabulated_force(s->forms + {3 * r}, {common}, s->f); break;"
                 )
                 energy.append(
-                    f"case {r}: tabulated_energy(cb_tabulated + {3 * r + 1}, {common}, out);"
-                    f" tabulated_energy(cb_tabulated + {3 * r + 2}, {common}, out + 1); break;"
+                    f"case {r}: tabulated_energy(s->forms + {3 * r + 1}, {common}, out);"
+                    f" tabulated_energy(s->forms + {3 * r + 2}, {common}, out + 1); break;"
                 )
         arguments = "region, blocks, first, c, g, k, s"
         parts.append(f"#define FORCE({arguments}) switch (region) {{ {' '.join(force)} }}")

@@ -411,9 +411,11 @@ def test_equal_steps_are_synchronous(comm, name, scheme, start):
 def test_any_number_of_ranks(comm, name, balanced):
     """All ranks together do what one does alone; and the same again, to the bit."""
     case, states = CASES[name], []
-    for one in (MPI.COMM_SELF, comm, comm):
-        cells = {1: 40, 2: (9, 6), 3: (5, 3, 3)}[case.dim]
-        run = prepared(build(one, case, graded(one, case.dim, cells)), AVI(balanced=balanced), 10.0)
+    cells = {1: 40, 2: (9, 6), 3: (5, 3, 3)}[case.dim]
+    alone, together = (graded(one, case.dim, cells) for one in (MPI.COMM_SELF, comm))
+    # One mesh for both runs on all ranks: another one may be cut between the ranks otherwise.
+    for mesh in (alone, together, together):
+        run = prepared(build(mesh.comm, case, mesh), AVI(balanced=balanced), 10.0)
         run.advance(6)
         states.append((whole(run.problem.scene.mesh)[0], *state(run)))
     distance, at = scipy.spatial.cKDTree(states[0][0]).query(states[1][0])
@@ -426,16 +428,45 @@ def test_any_number_of_ranks(comm, name, balanced):
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_touches_count(comm, scheme):
     """Nodes drift where their cells act even if no force comes of it: for any number of ranks."""
-    states = []
+    states, plans = [], []
     for one in (MPI.COMM_SELF, comm):
         mesh = graded(one, 2, (7, 5), pull=1.0)
         scene = cb.Scene(mesh, pair(2, 30.0, own=0.0), initial=cb.Initial(nu_dot=1.0))
         run = prepared(scene, AVI(dissipation=scheme), 10.0)
+        plans.append((run.step, sorted(divisions_of(run).tolist())))
         run.advance(4)
+        states.append((whole(mesh)[0], *state(run)))
+    # If states differ, these tell whether bodies or schedules did before.
+    distance, at = scipy.spatial.cKDTree(states[0][0]).query(states[1][0])
+    assert distance.max() < 1e-14 and plans[0] == plans[1], (distance.max(), plans)
+    for alone, together in list(zip(*states, strict=True))[1:]:
+        assert abs(alone[at] - together).max() < 1e-14
+
+
+@pytest.mark.filterwarnings("ignore:The energy of .* does not see the mode")
+@pytest.mark.parametrize("balanced", [False, True], ids=["plain", "balanced"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_touches_without_forces(comm, scheme, balanced):
+    """The same where every kick is exactly zero; and all copies of a node are equal to the bit."""
+    body = cb.Body(1, lambda U, nu, N: 0.5 * (U[0, 0] ** 2 + U[0, 1] ** 2), 1.0, 1.0, 30.0,
+                   displacement=1)  # fmt: skip
+    states = []
+    for one in (MPI.COMM_SELF, comm):
+        mesh = graded(one, 2, (7, 5))
+        scene = cb.Scene(mesh, body, initial=cb.Initial(nu_dot=1.0))
+        run = prepared(scene, AVI(dissipation=scheme, balanced=balanced), 10.0)
+        assert run.time_sets.asynchronicity > 3
+        run.advance(2)
         states.append((whole(mesh)[0], *state(run)))
     _, at = scipy.spatial.cKDTree(states[0][0]).query(states[1][0])
     for alone, together in list(zip(*states, strict=True))[1:]:
-        assert abs(alone[at] - together).max() < 1e-14
+        assert abs(alone[at] - together).max() < 1e-15
+    assert scheme == "exact" or np.ptp(states[0][2][:, 1]) > 1e-3, "touches say nothing"
+    disc = run.problem.disc
+    mine = dict(zip(_compat.node_map(mesh).local_to_global(disc.dof.astype(np.int32)).tolist(),
+                    run.record[:-1].tolist(), strict=True))  # fmt: skip
+    for other in comm.allgather(mine):
+        assert all(mine[node] == copy for node, copy in other.items() if node in mine)
 
 
 @pytest.mark.parametrize("balanced", [False, True], ids=["plain", "balanced"])
