@@ -211,7 +211,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
             times = np.linspace(0, found["long"], len(change))
             colour, dash = COLOURS[row["method"].split(",")[0]], ":" if row["data"] == "random" else "-"
             ax.plot(times, change, dash, lw=1.0, label=f"{row['method']}, {row['data']}", color=colour)
-    ax.legend(frameon=False, fontsize=9)
+    ax.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(0.0, 0.63))
     ax.set(title=f"Change of energy [%], {first} per side", xlabel="steps, or windows")
     for ax in axes.flat:
         ax.grid(True, lw=0.4, color="0.9")

@@ -34,7 +34,7 @@ class WindowRun(RecordRun):
         self.plan = WindowPlan(problem.disc, window)
         count = per_cell(problem.disc, problem.disc.group[:, None])
         # Half kicks at both ends are one force more than events.
-        ends = int(method.start == "trapezoidal")
+        ends = int(method.start == "trapezoidal" and not method.balanced)
         self.time_sets = time_sets(
             problem.disc, window / count, critical, window, count, ends=ends
         )
