@@ -160,7 +160,7 @@ def _integrator(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--schedule", choices=SCHEDULES,
-        help="avi: repeating windows (default), the same by powers of two, or any real steps",
+        help="avi: windows, the same by powers of two (default if balanced), or any real steps",
     )  # fmt: skip
     group.add_argument(
         "--corrected", action=argparse.BooleanOptionalAction, default=None,
@@ -169,14 +169,8 @@ def _integrator(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--balanced", action=argparse.BooleanOptionalAction, default=None,
-        help="avi on windows: act against a smooth reference stress (default), or plainly",
+        help="avi: forces act through the steps (default), or in kicks",
     )  # fmt: skip
-    group.add_argument(
-        "--passes", metavar="N", type=int, help="avi: smoothing passes of the reference; default 2"
-    )
-    group.add_argument(
-        "--filter", metavar="E", type=float, help="avi: strength of the rates' filter; default 0.01"
-    )
     group.add_argument(
         "--stabilisation", metavar="NU", type=float,
         help="local-leapfrog: ν of the Chebyshev filter; default 0.15, 0 is none",

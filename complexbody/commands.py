@@ -42,7 +42,7 @@ from complexbody.together import Interrupted, say, together
 INTEGRATORS = {"synchronous": Synchronous, "avi": AVI, "local-leapfrog": LocalLeapfrog}
 _OPTIONS = (
     "step", "safety", "dissipation", "start", "critical", "unstable_ok", "schedule", "balanced",
-    "corrected", "passes", "filter", "stabilisation", "levels",
+    "corrected", "stabilisation", "levels",
 )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ from complexbody.scene import Scene
 SETTINGS = (
     "until", "every", "times", "fields", "probes", "probe_steps", "ledger_steps", "out",
     "integrator", "step", "safety", "dissipation", "start", "critical", "unstable_ok",
-    "balanced", "passes", "filter", "stabilisation", "levels",
+    "balanced", "stabilisation", "levels",
 )  # fmt: skip
 
 

@@ -170,6 +170,17 @@ class _Region:
         return np.where(unlimited, np.inf, low)
 
 
+def initial_matrices(problem: Problem, number: int) -> Array:
+    """Stiffness of the cells of a region FFCx takes, at the initial state (cells · W, local, local).
+
+    In the basis in which inertia and viscosity are diagonal.
+    """
+    rho = cell_densities(problem)[problem.disc.region == number]
+    matrices = _Region(problem, number, rho).matrices
+    assert matrices is not None
+    return matrices
+
+
 def cell_steps(problem: Problem, scheme: str = "exact") -> Array:
     """Critical step of every cell of this rank by its own pencil, shape (blocks, W) [s].
 

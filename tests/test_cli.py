@@ -63,7 +63,7 @@ def scene(comm):
 """
 _BOTH = (
     "--set --until --integrator --step --safety --dissipation --start --critical --unstable-ok "
-    "--balanced --passes --filter --stabilisation --levels --debug"
+    "--balanced --stabilisation --levels --debug"
 )
 OPTIONS = {
     "run": f"{_BOTH} --out --every --fields --probe --probe-steps --ledger-steps --no-picture "
@@ -309,7 +309,7 @@ def test_local_steps(bar, call, comm, shared_path, integrator):
         (("run", "FILE", "--levels", "2"), 2, "Integrator synchronous has no option levels"),
         (("run", "FILE", *LEAPFROG, "--levels", "-1"), 2, "levels is -1. Give 0 to 20"),
         (("run", "FILE", *LEAPFROG, "--stabilisation", "-1"), 2, "stabilisation is -1.0. Give"),
-        (("check", "FILE", *LEAPFROG, "--filter", "0"), 2, "has no option filter. It has"),
+        (("check", "FILE", *LEAPFROG, "--balanced"), 2, "has no option balanced. It has"),
     ],
 )
 def test_errors(bar, call, shared_path, words, code, message):

@@ -4,8 +4,8 @@
 At an event of cell K its nodes drift to t, the force is taken there, and each node is kicked by
 h_K times it: (Discr-dAL1), (Discr-dAL2) with the dissipation's sign corrected. What differs is
 when: at the multiples of any h_K ("exact"), or in windows whose order of events repeats. Windows
-may be ``balanced``: against a smooth reference stress taken at the window's start, whose assembled
-force drives the drifts, neighbours need not cancel each other at different times (DESIGN §5).
+may be ``balanced``: a cell's force then acts all through its steps instead of in kicks, so that
+neighbours, who nearly cancel each other, do so at any time (balance.py).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from complexbody.errors import IntegratorError, StepError, agree
 from complexbody.integrators.exact_run import ExactRun
 from complexbody.integrators.exact_schedule import span_length
 from complexbody.integrators.window_run import WindowRun
-from complexbody.integrators.windows import divisions, window_length
+from complexbody.integrators.windows import divisions, graded, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps
@@ -37,13 +37,12 @@ class AVI:
     Attributes:
         safety: α, the fraction of each cell's critical step it may use. Resonances start near
             0.47 of it on bars of two rates, hence 0.45.
-        schedule: "windows" (N_K = ⌈W/h_K⌉ equal steps per window), "octaves" (N_K rounded up to a
-            power of two) or "exact" (any real h_K, events at its multiples).
-        balanced: Act against a smoothed reference stress, which removes the error floor of
-            asynchronous stepping; the default on windows. False gives plain windows, an AVI of the
-            paper with rational time sets, symplectic, with the floor. An exact schedule is plain.
-        passes: Smoothing passes of the reference (cell → node → cell).
-        filter: ε of the filter v −= ε(I − S)³v at window ends (balanced only); 0 is none.
+        schedule: "octaves" (N_K = ⌈W/h_K⌉ equal steps per window rounded up to a power of two, and
+            until neighbours differ by two at most; the default), "windows" (N_K as it is; the default
+            if not balanced) or "exact" (any real h_K, events at its multiples).
+        balanced: Forces act through the cells' steps, which removes the error floor of asynchronous
+            stepping; the default on octaves, and only there. False gives an AVI of the paper with
+            rational time sets, symplectic, with the floor. An exact schedule is plain.
         dissipation: "exact", "symmetric" or "forward", as for Synchronous.
         start: "trapezoidal" (a cell's first kick is a half, order 2) or "one-sided" (the paper's,
             order 1; not balanced).
@@ -58,10 +57,8 @@ class AVI:
     """
 
     safety: float = 0.45
-    schedule: str = "windows"
+    schedule: str | None = None
     balanced: bool | None = None
-    passes: int = 2
-    filter: float = 0.01
     dissipation: str = "exact"
     start: str = "trapezoidal"
     corrected: bool | None = None
@@ -75,6 +72,9 @@ class AVI:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.safety) and 0 < self.safety):
             raise StepError(f"AVI: safety is {self.safety}. Give a positive number, 0.45 or less.")
+        if self.schedule is None:
+            plain = self.balanced is False or self.start == "one-sided"
+            object.__setattr__(self, "schedule", "windows" if plain else "octaves")
         for name, allowed in (
             ("dissipation", SCHEMES),
             ("schedule", SCHEDULES),
@@ -85,11 +85,10 @@ class AVI:
                     f"AVI: {name}={getattr(self, name)!r} is not known. Give one of "
                     f"{', '.join(allowed)}."
                 )
-        if self.passes < 1 or self.filter < 0:
-            raise IntegratorError("AVI: give passes ≥ 1 and filter ≥ 0.")
         exact, whole = self.schedule == "exact", self.start == "one-sided"
+        octaves = self.schedule == "octaves"
         if self.balanced is None:
-            object.__setattr__(self, "balanced", not exact and not whole)
+            object.__setattr__(self, "balanced", octaves and not whole)
         if self.corrected is None:
             object.__setattr__(self, "corrected", exact)
         for wrong, advice in (
@@ -98,8 +97,13 @@ class AVI:
                 "schedule='exact' has no windows to balance. Use balanced=False",
             ),
             (
+                not octaves and self.balanced,
+                "balanced windows are stable only where neighbours' steps differ by two at most. "
+                "Use schedule='octaves'",
+            ),
+            (
                 whole and self.balanced,
-                "balanced windows kick half at both ends. Use balanced=False, or "
+                "balanced windows start from the force half a step on. Use balanced=False, or "
                 "start='trapezoidal'",
             ),
             (
@@ -128,7 +132,7 @@ class AVI:
 
     @property
     def symplectic(self) -> bool:
-        """Balanced windows only nearly are: the reference depends on the state."""
+        """Balanced windows are reversible in time, but the forces cells hold are states of their own."""
         return not self.balanced
 
     def prepare(self, problem: Problem, until: float) -> WindowRun | ExactRun:
@@ -152,7 +156,9 @@ class AVI:
             blocks = np.full(critical.shape, np.inf)
             blocks[real] = np.where(np.isfinite(steps), steps, window)[disc.source_cell[real]]
             return ExactRun(problem, self, span_length(blocks, until, problem.comm), blocks, own)
-        problem.arrange(divisions(steps, window, self.schedule == "octaves"))
+        octaves = self.schedule == "octaves"
+        counts = divisions(steps, window, octaves)
+        problem.arrange(graded(problem, counts) if octaves else counts)
         return WindowRun(problem, self, window, own)
 
     def _given(self, problem: Problem, critical: Array) -> Array:

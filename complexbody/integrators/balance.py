@@ -1,9 +1,22 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The reference of balanced windows, and the filter that keeps it stable (DESIGN §5).
+r"""Balanced windows: a cell's force acts through its steps, not at their ends (DESIGN §5).
 
-At a window's start each cell's stress, carried to mid-window and smoothed, becomes the reference:
-its assembled force, small and smooth, acts all through the window, and cells kick with their
-force minus their share of it. A filter at the window's end takes what this feeds to rough modes.
+The forces of neighbouring cells nearly cancel at a node; kicks at different times do not. So cell K
+pulls at its nodes all the time, with a force F that changes at its own times t_j only, such that the
+mean of F before and behind is the force there:
+
+.. math:: F_{j+1/2} + F_{j-1/2} = 2 f_j, \qquad f_j = -\partial V_K(q(t_j)).
+
+F is the force half a step on, to second order, of any smooth motion; impulses over whole steps are
+those of the kicks it replaces. The rule is the same forwards and backwards in time, and starts from
+F_{1/2} = −∂V_K(q_0 + (h_K/2) q̇_0).
+
+An error ±δ that alternates from step to step neither grows nor decays. Viscosity would make it grow,
+by ω²h²·hη/(12ρ̄) per step for a cell of frequency ω (the mean of the displacement that it causes no
+longer is zero), so that there it must decay, which a kick makes up for:
+
+.. math:: F_{j+1/2} = (2-k) f_j - (1-k) F_{j-1/2}, \qquad
+   \text{kick}\; h \big(f_j - \tfrac12 (F_{j+1/2} + F_{j-1/2})\big).
 """
 
 from __future__ import annotations
@@ -12,80 +25,130 @@ import ctypes
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from complexbody import native
 from complexbody.integrators.records import RecordRun
-from complexbody.kernels import events
-from complexbody.timesets import cell_densities
+from complexbody.integrators.windows import WindowPlan
+from complexbody.masses import pencil_basis
+from complexbody.problem import Problem
+from complexbody.timesets import initial_matrices
 
 Array = npt.NDArray[np.float64]
+BEGIN = 1
+
+
+def blending(rates: Array, coupled: Array, step: float) -> Array:
+    """k of each component for steps h: min(1, z_i), or what coupling to others needs if larger.
+
+    With z = hη/ρ̄ component i feels component j by C_ij² z_j/(1 + z_j²): a descriptor that viscosity
+    holds fast (z ≫ 1) hardly moves, and then nothing comes of it. Where k > 0 a wave without viscosity
+    of its own would grow, by k times a high power of ωh; hence no more than needed.
+
+    Args:
+        rates: η/ρ̄ of the components [1/s], infinite without inertia.
+        coupled: C_ij², coupling of components by the energy, between 0 and 1.
+        step: h [s].
+    """
+    with np.errstate(invalid="ignore"):
+        z = rates * step
+        felt = np.where(z < 1e100, z / (1.0 + z * z), 0.0)
+    return np.minimum(np.maximum(z, (coupled * felt).max(axis=1)), 1.0)
+
+
+def component_rates(problem: Problem, number: int) -> Array:
+    """η/ρ̄ of the components of region ``number`` [1/s]; of several modes the fastest they are in."""
+    body, n_u = problem.scene.bodies[number], problem.scene.displacement
+    basis, mass, viscosity = pencil_basis(body.inertia_matrix, body.viscosity_matrix)
+    with np.errstate(divide="ignore"):
+        rate = np.where(viscosity > 0, viscosity / np.where(mass > 0, mass, 0.0), 0.0)
+    part = np.abs(basis) > 1e-12 * np.abs(basis).max()
+    return np.concatenate([np.zeros(n_u), np.where(part, rate, 0.0).max(axis=1)])
+
+
+def coupling(problem: Problem, number: int) -> Array:
+    """C_ij² = |H_ij|²/(|H_ii| |H_jj|) of components i ≠ j of region ``number``, shape (n, n).
+
+    Parts in gradients and in values apart, the largest of them and of up to a thousand cells; if the
+    density is not quadratic, of the cells' stiffness at the initial state.
+    """
+    n, kernels = problem.disc.n, problem.kernels
+    mine = problem.disc.region == number
+    cells = np.argwhere(problem.disc.source_cell[mine] >= 0)
+    cells = cells[:: len(cells) // 1000 + 1]
+    if not kernels.densities.generated[number]:
+        m = initial_matrices(problem, number).reshape(*problem.disc.source_cell[mine].shape, -1)
+        local = m[tuple(cells.T)].reshape(len(cells), -1, n, problem.disc.dim + 1, n)
+        size = np.linalg.norm(local, axis=(1, 3))
+        pairs = [(size, size, size)]
+    else:
+        H = np.zeros((len(cells), 4 * n, 4 * n))
+        for (i, j), values in kernels.densities.total(number).items():
+            for v in values:
+                if not isinstance(v, float):
+                    at = kernels.densities.coefficients.index(v)
+                    v = kernels.coefficients[mine][cells[:, 0], at, cells[:, 1]]
+                H[:, i, j] += v
+        split = H[:, : 3 * n, : 3 * n].reshape(-1, n, 3, n, 3)
+        waves, own = np.linalg.norm(split, axis=(2, 4)), np.abs(H[:, 3 * n :, 3 * n :])
+        mixed = np.linalg.norm(H[:, : 3 * n, 3 * n :].reshape(-1, n, 3, n), axis=2)
+        mixed = (mixed, waves, own), (mixed.transpose(0, 2, 1), own, waves)
+        pairs = [(waves, waves, waves), (own, own, own), *mixed]
+    out = np.zeros((n, n))
+    for size, one, other in pairs:
+        scale = np.einsum("cii,cjj->cij", one, other)
+        ratio = np.where(size > 0, size**2 / np.where(scale > 0, scale, size**2 + 1e-300), 0.0)
+        out = np.maximum(out, ratio.max(axis=0, initial=0.0))
+    problem.comm.Allreduce(MPI.IN_PLACE, out, op=MPI.MAX)
+    np.fill_diagonal(out, 0.0)
+    return np.minimum(out, 1.0)
 
 
 class Balance:
-    """Reference stresses of a run's cells, and its filter.
+    """The forces that a run's cells hold.
 
     Args:
-        run: The run whose cells act against it.
+        run: The run.
+        plan: Its groups.
 
     Attributes:
-        reference: Smoothed stresses of cells (blocks, values, W), times √|K|.
-        stress, old: Last and last but one stresses times |K|, summed over a node's cells.
+        held: F of cells (blocks, (d + 1)·n, W).
+        blend: k of each group (groups, NR).
     """
 
-    reference: Array
-    stress: Array
-    old: Array
+    def __init__(self, run: RecordRun, plan: WindowPlan) -> None:
+        self.run, self.plan, problem = run, plan, run.problem
+        disc = problem.disc
+        self.held = native.aligned((disc.blocks, (disc.dim + 1) * disc.n, disc.lanes))
+        self.blend = native.aligned((max(plan.count, 1), disc.record))
+        self._load = np.zeros((disc.nodes + 1, disc.record))
+        if problem.masses.damped:
+            numbers = range(len(problem.scene.bodies))
+            parts = [(component_rates(problem, r), coupling(problem, r)) for r in numbers]
+            for i in range(plan.count):
+                group = plan.groups[i]
+                self.blend[i, : disc.n] = blending(*parts[group.region], group.step)
 
-    def __init__(self, run: RecordRun) -> None:
-        self.run, problem = run, run.problem
-        disc, masses = problem.disc, problem.masses
-        values = max(events.references(problem.kernels), 1)
-        self.reference = native.aligned((disc.blocks, values, disc.lanes))
-        rows = -(-values // disc.lanes) * disc.lanes
-        self.stress, self.old, self._nodal, self._smoothed = (
-            native.aligned((disc.nodes + 1, rows)) for _ in range(4)
-        )
-        share = disc.geometry[:, -1, :] ** 2 / (disc.dim + 1) ** 2
-        self._cell_mass = np.ascontiguousarray(cell_densities(problem) * share)
-        self._inverse_node_mass = 1.0 / (masses.density[masses.classes[:-1]] * disc.volume)
-        if problem.comm.size > 1 and rows > disc.halo.outgoing.shape[1]:
-            run.halo = disc.halo.widened(rows)
+    def begin(self, t: float) -> None:
+        """Forces half a step behind t, from positions and rates there: those of the first steps."""
+        run, disc = self.run, self.run.problem.disc
+        run.c.cb_get_rates(run._world, native.pointer(run._rates))
+        q, rates = run.record[:, : disc.n].copy(), run._rates[:, : disc.n]
+        run.record[:, 2 * disc.record : 3 * disc.record] = 0.0
+        self._load[:] = 0.0
+        for i in range(self.plan.count):
+            run.record[:, : disc.n] = q + 0.5 * self.plan.groups[i].step * rates
+            run._together(t, BEGIN, first=i, last=i + 1, exchange=False)
+        run.record[:, : disc.n] = q
+        run._exchange(t)
+        run.updates += disc.count
 
-    def set(self, t: float, first: bool) -> None:
-        """Smoothed stress at mid-window, and the accelerations of its forces and of loads."""
-        run, disc, c = self.run, self.run.problem.disc, self.run.c
-        if first:
-            np.copyto(self.old, self.stress)
-        blocks = ctypes.c_int64(disc.blocks)
-        now, then = self._nodal, self._smoothed
-        c.cb_carry(run._world, native.pointer(self.old), native.pointer(now))
-        for left in reversed(range(run.method.passes)):
-            run._sum_shared(now)
-            c.cb_scale_nodes(run._world, native.pointer(now))
-            if left:
-                then[:] = 0.0
-                c.cb_smooth(run._world, blocks, native.pointer(now), native.pointer(then))
-                now, then = then, now
-        run._force[:] = 0.0
-        c.cb_to_cells(run._world, blocks, native.pointer(now), native.pointer(run._force))
-        run._add_loads(t + 0.5 * run.step)
-        run._sum_shared(run._force)
-        c.cb_accelerate(run._world, native.pointer(run._force))
-
-    def filter(self) -> float:
-        """v −= ε (I − S)³ v, S the mass-weighted average over cells and back: the energy it takes.
-
-        Fixed components stay, and so does the momentum of a free body.
-        """
+    def load(self, t: float) -> None:
+        """Loads at t act from now on, as a constant force."""
         run = self.run
-        change, out = native.pointer(run._rates), native.pointer(run._force)
-        blocks = ctypes.c_int64(run.problem.disc.blocks)
-        weight, inverse = native.pointer(self._cell_mass), native.pointer(self._inverse_node_mass)
-        run.c.cb_get_rates(run._world, change)
         run._force[:] = 0.0
-        for _ in range(3):
-            run.c.cb_average(run._world, blocks, weight, change, out)
-            run._sum_shared(run._force)
-            run.c.cb_subtract_average(run._world, inverse, change, out)
-        strength = ctypes.c_double(-run.method.filter)
-        return float(run.c.cb_change_rates(run._world, strength, change))
+        run._add_loads(t)
+        run._sum_shared(run._force)
+        np.subtract(run._force, self._load, out=self._load)
+        run.c.cb_accelerate(run._world, native.pointer(self._load))
+        self._load[:] = run._force

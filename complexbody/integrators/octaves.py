@@ -141,7 +141,7 @@ def node_steps(problem: Problem, cells: Array) -> tuple[Array, Array]:
     values[disc.source_cell[real]] = eigenvalue[real]
     most = np.zeros(disc.nodes + 1)
     np.maximum.at(most, disc.cells, eigenvalue[:, None, :])
-    most = _largest(problem, most[:-1])
+    most = largest(problem, most[:-1])
     alike = masses.pure[masses.classes[:-1]]
     if any(hasattr(body.density, "function_space") for body in problem.scene.bodies):
         alike = np.zeros_like(alike)
@@ -152,7 +152,7 @@ def node_steps(problem: Problem, cells: Array) -> tuple[Array, Array]:
     return alone, np.minimum(alone, beside)
 
 
-def _largest(problem: Problem, values: Array) -> Array:
+def largest(problem: Problem, values: Array) -> Array:
     """The largest of the values that ranks have for a node (nodes,); collective."""
     disc, halo, out = problem.disc, problem.disc.halo, values.copy()
     if problem.comm.size > 1:

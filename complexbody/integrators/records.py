@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """What all asynchronous runs share: node records, masses by class, loads, supports, the books.
 
-A node's record holds its position and rate, its own time and, against a reference, an acceleration
-(events.h). Runs differ in who acts when; between two *beats* of length ``step`` (a window, or a
+A node's record holds its position and rate, its own time and, if balanced, an acceleration
+(drifts.h). Runs differ in who acts when; between two *beats* of length ``step`` (a window, or a
 span of exact events) they are all alike: supports move evenly, loads kick at the beat's ends.
 """
 
@@ -39,7 +39,7 @@ class World(ctypes.Structure):
             for name in (
                 "record", "klass", "inverse_mass", "rate", "compliance", "eta", "basis",
                 "inverse_basis", "collected",
-                "groups", "cell", "geometry", "coefficient", "reference", "stress", "sums",
+                "groups", "cell", "geometry", "coefficient", "held", "blend", "sums",
                 "counted", "coordinates", "forms", "touched", "touched_from",
             )
         ),
@@ -85,11 +85,12 @@ class RecordRun:
         slow = not masses.diagonal or (masses.damped and not masses.one_rate)
         self.c = events.load(kernels, method, masses.damped, slow)
         self._nodes()
-        self.collected = native.aligned((max(disc.shared, 1), disc.record))
+        sent = disc.record * (2 if method.balanced else 1)
+        self.collected = native.aligned((max(disc.shared, 1), sent))
         self._force = native.aligned((disc.nodes + 1, disc.record))
         self._rates = native.aligned((disc.nodes + 1, disc.record))
         self._counted = np.append(disc.owned, False)  # padding cells' node counts for nothing
-        self.halo = disc.halo
+        self.halo = disc.halo.widened(sent) if sent > disc.record else disc.halo
         self.sums = kernels.sums
         self.sums[:] = 0.0
         self.work, self.support_work, self.filtered = 0.0, 0.0, 0.0
@@ -101,7 +102,7 @@ class RecordRun:
         self._support_force: Array | None = None
         if self._supported:
             self._support_force = self._forces_at(self.record, 0.0)[problem.moving]
-        self._forms = events.Forms(kernels, bool(method.balanced))
+        self._forms = events.Forms(kernels)
         self.world = world = World()
         # Moving supports are late, too, but only shared nodes wait for the other ranks' kicks.
         world.nodes, world.late, world.beyond = disc.nodes, disc.late, disc.late + disc.shared
@@ -242,8 +243,8 @@ class RecordRun:
 
     def _begin(self) -> None:
         """Send the kicks that this rank's cells gave to shared nodes."""
-        halo, n = self.halo, self.problem.disc.record
-        halo.outgoing[:, :n] = self.collected[halo.sends]
+        halo = self.halo
+        halo.outgoing[:, : self.collected.shape[1]] = self.collected[halo.sends]
         halo.begin()
 
     def _end(self, t: float, rows: npt.NDArray[np.int32]) -> None:

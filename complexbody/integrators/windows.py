@@ -21,7 +21,9 @@ from mpi4py import MPI
 
 from complexbody.discretisation import Discretisation
 from complexbody.errors import StepError
+from complexbody.integrators.octaves import largest
 from complexbody.kernels.events import CHUNK
+from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -67,6 +69,34 @@ def divisions(steps: Array, window: float, octaves: bool = False) -> Ints:
     count = np.maximum(count, 1)
     unit = 1 << np.maximum(np.frexp(count)[1] - 1 - (0 if octaves else DIGITS), 0)
     return -(-count // unit) * unit
+
+
+def graded(problem: Problem, counts: Ints) -> Ints:
+    """N_K raised until cells that share a node differ by a factor of two at most; collective.
+
+    A node then moves with frequencies ω ≤ 2α/h of its smallest cell's h, too slow to be driven by
+    what its largest cell, of at most 2h, does twice in a period: 2ω < 2π/(2h) if α < π/4.
+
+    Args:
+        problem: The scene.
+        counts: N_K of this rank's cells, in the order of dolfinx's owned cells.
+    """
+    disc = problem.disc
+    real = disc.source_cell >= 0
+    now = np.zeros(real.shape)
+    now[real] = counts[disc.source_cell[real]]
+    while True:
+        most = np.zeros(disc.nodes + 1)
+        np.maximum.at(most, disc.cells, now[:, None, :])
+        most[:-1] = largest(problem, most[:-1])
+        least = np.ceil(most[disc.cells].max(axis=1) / 2)
+        changed = bool(np.any(least[real] > now[real]))
+        now[real] = np.maximum(now, least)[real]
+        if not problem.comm.allreduce(changed, op=MPI.LOR):
+            break
+    out = np.zeros_like(counts)
+    out[disc.source_cell[real]] = now[real]
+    return out
 
 
 @dataclass

@@ -1,12 +1,10 @@
 /* SPDX-License-Identifier: LGPL-3.0-or-later
  * Asynchronous events: what nodes and cells carry, and how a node drifts from kick to kick. Behind
  * vectors.h and tabulated.h. A node's record holds everything a drift needs:
- *   [ position (NR) | rate (NR) | acceleration (NR, only with a reference force) | time, 1/volume ]
+ *   [ position (NR) | rate (NR) | acceleration (NR, only if BALANCED) | time, 1/volume ]
  * time and 1/volume sit in the padding of position where there is room (TIME, INVERSE).
- * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK, and of the
- * reference: PLACES, the place of each of the N DIM stresses (equal ones share it), STRESSES of them,
- * REFERENCES with the self-actions behind. Unless SLOW, inertia is diagonal and the components of
- * nu share one rate. */
+ * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK. Unless SLOW,
+ * inertia is diagonal and the components of nu share one rate. */
 
 #define VN (NR < 8 ? NR : 8)
 typedef double nvec __attribute__((vector_size(8 * VN), aligned(8)));
@@ -21,7 +19,8 @@ typedef double nvec __attribute__((vector_size(8 * VN), aligned(8)));
 #define INVERSE (PARTS * NR + 1)
 #endif
 
-#define ROWS ((REFERENCES + W - 1) / W) /* vectors per node in [node][ROWS * W] */
+#define HELD (BALANCED * (DIM + 1) * N) /* nodal forces that a cell holds */
+#define SENT ((1 + BALANCED) * NR)      /* what a shared node collects: impulse, change of force */
 
 typedef struct { int64_t first, last, region, divisions, chunk; double step; } group; /* blocks, N_K, h_K */
 typedef struct { double time; int64_t group; } happening; /* a group acts, time within the window */
@@ -35,15 +34,15 @@ typedef struct {
   const double *compliance;   /* [class][NR]: 1 / eta where there is no inertia, else 0 */
   const double *eta;          /* [class][NR]: damping per volume */
   const double *basis, *inverse_basis; /* [class][N][N]: V, in which all these are diagonal */
-  double *collected;          /* [shared nodes][NR] */
+  double *collected;          /* [shared nodes][SENT] */
   const group *groups;
   const int32_t *cell;
   const double *geometry, *coefficient;
-  double *reference;          /* [block][REFERENCES][lane] */
-  double *stress;             /* [node][ROWS * W]: sum of volume times stress of the node's cells */
+  double *held;               /* [block][vertex][N][lane]: the force that acts until the next event */
+  const double *blend;        /* [group][NR]: k */
   double *sums;               /* dissipated work */
   const uint8_t *counted;
-  const double *coordinates;  /* [node][3], and for tabulated regions [region]{force, stress}: */
+  const double *coordinates;  /* [node][3], and for tabulated regions [region]: */
   const tabulated *forms;
   const int32_t *touched;     /* the nodes of each chunk of CHUNK blocks no chunk of its group had */
   const int64_t *touched_from; /* [chunk + 1] */

@@ -1,66 +1,38 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Straight-line C for asynchronous events of cells with a constant Hessian: see quadratic.py.
 
-At an event the nodes have drifted to t; the stress there, or what it differs from the reference by,
-times the step is the kick. Knows no schedule.
+At an event the nodes have drifted to t; the force there times the step is the kick, or changes the
+force that acts through the step. Knows no schedule.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
-from complexbody.kernels.quadratic import RegionSource, entry_text
+from complexbody.kernels.quadratic import RegionSource
 
 
 class EventSource(RegionSource):
     """Events of one region: ``event_r`` for cells that act together, ``lone_r`` for others."""
 
-    def stress_rows(self) -> list[tuple[Any, ...]]:
-        """What each of the n·d stresses is made of: equal rows are equal stresses."""
-        own = self.gradients + self.values
-        return [
-            tuple((j, entry_text(self.total[i, j])) for j in own if (i, j) in self.total)
-            for i in self.gradients
-        ]
-
-    def event(self, slots: Sequence[int], values: bool) -> str:
-        """Source of ``event_r``: force at the drifted positions (against the reference), kick.
-
-        Args:
-            slots: Place of each of the n·d stresses among the references; none without a reference.
-            values: n mean self-actions z stand behind them.
-        """
-        d, n, nodes = self.dim, self.n, range(self.dim + 1)
+    def event(self, balanced: bool) -> str:
+        """Source of ``event_r``: force at the drifted positions, then a kick or a change of force."""
+        d, nodes = self.dim, range(self.dim + 1)
         lines = self._gradient_lines("gather_records(s, c + a * W, q[a])")
         between = ["ahead(b, GEOMETRY);"]
-        if slots:
-            kept = {slot: f"left[{slot}] = s_[{i}];" for i, slot in enumerate(slots)}
-            against = [f"s_[{i}] -= reference[{slot}];" for i, slot in enumerate(slots)]
-            if values:
-                first = len(kept)
-                kept |= {first + i: f"left[{first + i}] = z[{i}];" for i in range(n)}
-                at = [f"reference[{first + i}] * b[{d * d}] / {d + 1}.0" for i in range(n)]
-                against += [f"p[{i}] -= {at[i]};" for i in range(n)]
-            between += [
-                "const vec *reference = (const vec *)(held + m * REFERENCES * W);",
-                "ahead(reference, REFERENCES);",
-                f"if (mode & KEEP) {{ vec left[REFERENCES]; {' '.join(kept.values())}",
-                f"  keep(s, c, b[{d * d}], left); }}",
-                f"if (mode & AGAINST) {{ {' '.join(against)} }}",
-            ]
-        # There are fewer stresses than forces: they take the weight.
-        between += [f"s_[{i}] *= weight;" for i in range(n * d)]
-        between += [f"p[{i}] *= weight;" for i in range(n)]
+        if balanced:
+            between.append("vec *now = (vec *)(held + m * HELD * W); ahead(now, HELD);")
+            forces = self._force_lines(between)
+            give = [f"hold(s, c + {a} * W, h, f{a}, now + {a} * N, blend, mode);" for a in nodes]
+        else:
+            # There are fewer stresses than forces: they take the weight.
+            between += [f"s_[{i}] *= h;" for i in range(self.n * d)]
+            between += [f"p[{i}] *= h;" for i in range(self.n)]
+            forces = self._force_lines(between, weight="h * ")
+            give = [f"kick(s, c + {a} * W, (vec){{0}} + 1.0, f{a});" for a in nodes]
         return self._loop(
             f"static void event_{self.number}(int64_t blocks, const int32_t *restrict c, "
             "const double *restrict geometry, const double *restrict coefficient, "
-            "const double *restrict held, const world *s, double weight, int mode)",
-            [
-                *lines,
-                *self._force_lines(between, with_values=values and bool(slots), weight="weight * "),
-                *(f"kick(s, c + {a} * W, (vec){{0}} + 1.0, f{a});" for a in nodes),
-            ],
+            "double *restrict held, const double *restrict blend, const world *s, double h, int mode)",
+            [*lines, *forces, *give],
         )
 
     def lone(self, corrected: bool) -> str:

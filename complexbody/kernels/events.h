@@ -2,7 +2,8 @@
  * Asynchronous events: W cells act once at a common time, each with its own step as weight.
  *
  * At an event of cell K at t (paper (Discr-dAL1), (Discr-dAL2)): its nodes drift to t, the force is
- * taken there, and each node is kicked by h_K f. Behind drifts.h. */
+ * taken there, and each node is kicked by h_K f. BALANCED, a force acts through the step instead.
+ * Behind drifts.h. */
 
 /* Drift distinct nodes to t. */
 INLINE void drift_all(const world *s, const int32_t *nodes, int64_t count, double t) {
@@ -58,17 +59,18 @@ INLINE int collects(const world *s, const int32_t *c) {
   return any;
 }
 
-/* Kick the nodes of W cells: rate += weight f / (volume m); shared nodes collect. */
-INLINE void kick(const world *s, const int32_t *c, const vec weight, const vec in[NR]) {
+/* The nodes of W cells: rate (PART 1) or acceleration (2) += weight in / (volume m); shared ones collect. */
+enum { RATE = 1, ACCELERATION = 2 };
+INLINE void give(const world *s, const int32_t *c, const vec weight, const vec in[NR], const int PART) {
   if (collects(s, c) || SLOW || (NR < W && NR != 4)) {
     for (int l = 0; l < W; l++) {
       const int64_t a = c[l];
-      double *r = record_of(s, a), f[N];
+      double *r = record_of(s, a), f[N], *sum = s->collected + (a - s->late) * SENT + (PART - 1) * NR;
       for (int i = 0; i < N; i++) f[i] = in[i][l];
       if (a >= s->late && a < s->beyond)
-        for (int i = 0; i < N; i++) s->collected[(a - s->late) * NR + i] += weight[l] * f[i];
+        for (int i = 0; i < N; i++) sum[i] += weight[l] * f[i];
       else
-        impulse(s, a, f, weight[l] * r[INVERSE], r + NR);
+        impulse(s, a, f, weight[l] * r[INVERSE], r + PART * NR);
     }
     return;
   }
@@ -80,7 +82,7 @@ INLINE void kick(const world *s, const int32_t *c, const vec weight, const vec i
     for (int l = 0; l < W; l++) {
       double *r = record_of(s, c[l]);
       const double *m = s->inverse_mass + (s->klass ? s->klass[c[l]] : 0) * NR + g;
-      *(vec_u *)(r + NR + g) += r[INVERSE] * *(const vec_u *)m * f[l];
+      *(vec_u *)(r + PART * NR + g) += r[INVERSE] * *(const vec_u *)m * f[l];
     }
   }
 #elif !SLOW && NR == 4
@@ -92,77 +94,62 @@ INLINE void kick(const world *s, const int32_t *c, const vec weight, const vec i
     const nvec q = l < 4 ? (nvec){p[0], p[1], p[2], p[3]} : (nvec){p[4], p[5], p[6], p[7]};
     double *r = record_of(s, c[l]);
     const double *m = s->inverse_mass + (s->klass ? s->klass[c[l]] : 0) * NR;
-    *(nvec *)(r + NR) += r[INVERSE] * *(const nvec *)m * q;
+    *(nvec *)(r + PART * NR) += r[INVERSE] * *(const nvec *)m * q;
   }
 #endif
 }
 
-/* What a block does besides kicking: keep its stress, or act against the reference. */
-enum { KEEP = 1, AGAINST = 2 };
+INLINE void kick(const world *s, const int32_t *c, const vec weight, const vec in[NR]) {
+  give(s, c, weight, in, RATE);
+}
 
-/* Where the stress of a component along an axis stands among the references. */
-#if REFERENCES
-static const int slot[N * DIM] = PLACES;
-
-/* Leave stresses (times r, the root of the volume) behind: node += r stress, once per window. */
-__attribute__((unused, noinline)) static void keep(const world *s, const int32_t *c, vec r,
-                                                   const vec *stress) {
-  for (int g = 0; g < ROWS; g++) {
-    vec row[W];
-    for (int i = 0; i < W; i++)
-      row[i] = g * W + i < REFERENCES ? r * stress[g * W + i] : (vec){0};
-    transpose(row);
-    for (int l = 0; l < W; l++)
-      for (int a = 0; a <= DIM; a++)
-        *(vec_u *)(s->stress + (int64_t)c[a * W + l] * ROWS * W + g * W) += row[l];
+#if BALANCED
+/* Balanced: a force F acts on the node through the whole step h, and at its end
+ *   F+ = (2 - k) f - (1 - k) F-,   kick h (f - (F+ + F-)/2) = (h k/2) (f - F-);
+ * without viscosity k = 0: the mean of F before and behind is f, and nothing is left to kick with.
+ * BEGIN: F+ = f. `held` is F of this vertex. */
+enum { BEGIN = 1 };
+INLINE void hold(const world *s, const int32_t *c, double h, const vec f[NR], vec *held,
+                 const double *k, int mode) {
+  const vec one = (vec){0} + 1.0;
+  vec change[NR] = {{0}}, rest[NR] = {{0}};
+  if (mode & BEGIN) {
+    for (int i = 0; i < N; i++) held[i] = change[i] = f[i];
+  } else {
+    for (int i = 0; i < N; i++) {
+      const vec wrong = f[i] - held[i];
+      change[i] = (DAMPED ? 2.0 - k[i] : 2.0) * wrong;
+      rest[i] = (DAMPED ? 0.5 * h * k[i] : 0.0) * wrong;
+      held[i] += change[i];
+    }
+    if (DAMPED) kick(s, c, one, rest);
   }
+  give(s, c, one, change, ACCELERATION);
 }
 #endif
 
-/* An event of cells whose density is not quadratic: forces and mean stresses by FFCx. */
-__attribute__((unused)) static void tabulated_event(
-    const tabulated *force, const tabulated *stress, int64_t blocks, int64_t first, const int32_t *c,
-    const double *geometry, const double *held, const world *s, double weight, int mode) {
+/* An event of cells whose density is not quadratic: forces by FFCx. */
+__attribute__((unused)) static void tabulated_event(const tabulated *force, int64_t blocks,
+                                                    int64_t first, const int32_t *c, double *held,
+                                                    const double *k, const world *s, double h,
+                                                    int mode) {
   const int zero = 0; const uint8_t none = 0;
-  double w[force->before + force->after + stress->before + stress->after + LOCAL + 1];
-  double at[3 * (DIM + 1)], out[LOCAL], mean[REFERENCES + 1];
+  double w[force->before + force->after + LOCAL + 1], at[3 * (DIM + 1)], out[LOCAL];
   for (int64_t m = 0; m < blocks; m++, c += (DIM + 1) * W) {
-    const vec *b = (const vec *)(geometry + m * GEOMETRY * W);
-    vec f[DIM + 1][NR], left[ROWS * W + 1];
+    vec f[DIM + 1][NR];
     memset(f, 0, sizeof f);
-    memset(left, 0, sizeof left);
-    for (int l = 0; l < W && c[l] < s->nodes; l++) {
-      if (force->function) {
-        tabulated_input(force, first + m, l, c, s->record, RECORD, s->coordinates, w, at);
-        memset(out, 0, sizeof out);
-        force->function(out, w, force->constants, at, &zero, &none, 0);
-        for (int a = 0; a <= DIM; a++)
-          for (int i = 0; i < N; i++) f[a][i][l] = -out[a * N + i];
-      }
-      if ((mode & KEEP) && REFERENCES && stress->function) {
-        tabulated_input(stress, first + m, l, c, s->record, RECORD, s->coordinates, w, at);
-        memset(mean, 0, sizeof mean);
-        stress->function(mean, w, stress->constants, at, &zero, &none, 0);
-        for (int i = 0; i < REFERENCES; i++) /* the mean times sqrt|K| */
-          left[i][l] = mean[i] / b[DIM * DIM][l];
-      }
+    for (int l = 0; l < W && c[l] < s->nodes && force->function; l++) {
+      tabulated_input(force, first + m, l, c, s->record, RECORD, s->coordinates, w, at);
+      memset(out, 0, sizeof out);
+      force->function(out, w, force->constants, at, &zero, &none, 0);
+      for (int a = 0; a <= DIM; a++)
+        for (int i = 0; i < N; i++) f[a][i][l] = -out[a * N + i];
     }
-#if REFERENCES
-    if (mode & KEEP) keep(s, c, b[DIM * DIM], left);
-    if (mode & AGAINST) {
-      const vec *r = (const vec *)(held + m * REFERENCES * W);
-      for (int i = 0; i < N; i++) {
-        const vec z = REFERENCES > STRESSES ? r[STRESSES + i] * b[DIM * DIM] / (DIM + 1.0) : (vec){0};
-        for (int a = 1; a <= DIM; a++) {
-          vec y = {0};
-          for (int j = 0; j < DIM; j++) y += r[slot[i * DIM + j]] * b[(a - 1) * DIM + j];
-          f[a][i] += y + z;
-          f[0][i] -= y;
-        }
-        f[0][i] += z;
-      }
-    }
+    for (int a = 0; a <= DIM; a++)
+#if BALANCED
+      hold(s, c + a * W, h, f[a], (vec *)held + (m * (DIM + 1) + a) * N, k, mode);
+#else
+      kick(s, c + a * W, (vec){0} + h, f[a]);
 #endif
-    for (int a = 0; a <= DIM; a++) kick(s, c + a * W, (vec){0} + weight, f[a]);
   }
 }

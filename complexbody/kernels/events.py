@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from complexbody import native
 from complexbody.kernels.event_source import EventSource
-from complexbody.kernels.ffcx import Tabulated, TabulatedRecord
+from complexbody.kernels.ffcx import TabulatedRecord
 from complexbody.kernels.library import Kernels
 from complexbody.masses import SCHEMES
 
@@ -33,44 +33,15 @@ def regions(kernels: Kernels) -> list[EventSource | None]:
     return out
 
 
-def has_values(kernels: Kernels) -> bool:
-    """True if a region may have self-actions, and the reference thus holds n of them."""
-    return any(region is None or region.has_values for region in regions(kernels))
-
-
-def slots(kernels: Kernels) -> list[int]:
-    """Place of each of the n·d stresses in the reference: those equal in all regions share it."""
-    disc, found = kernels.disc, regions(kernels)
-    if any(region is None for region in found):
-        return list(range(disc.n * disc.dim))
-    rows = list(zip(*(region.stress_rows() for region in found if region), strict=True))
-    distinct = list(dict.fromkeys(rows))
-    return [distinct.index(row) for row in rows]
-
-
-def references(kernels: Kernels) -> int:
-    """Reference values per cell: distinct stresses, and n self-actions if a region may have any."""
-    return max(slots(kernels)) + 1 + (kernels.disc.n if has_values(kernels) else 0)
-
-
 class Forms:
-    """Forces and, for a reference, stresses of the regions FFCx takes, as the loops read them."""
+    """Forces of the regions FFCx takes, as the loops read them."""
 
-    def __init__(self, kernels: Kernels, balanced: bool) -> None:
-        disc, action = kernels.disc, kernels.action
-        self.records = (TabulatedRecord * (2 * len(action.scene.bodies)))()
-        self._keep = []
-        values = has_values(kernels)
-        for r, body in enumerate(action.scene.bodies):
-            if kernels.densities.generated[r]:
-                continue
-            force = kernels.tabulated[r][0]
-            self.records[2 * r] = force.record
-            self._keep.append(force)
-            if balanced:
-                stress = Tabulated(action, disc, form=action.stress_form(body, values))
-                self.records[2 * r + 1] = stress.record
-                self._keep.append(stress)
+    def __init__(self, kernels: Kernels) -> None:
+        bodies = range(len(kernels.action.scene.bodies))
+        self._keep = {r: kernels.tabulated[r][0] for r in bodies if not kernels.densities.generated[r]}
+        self.records = (TabulatedRecord * len(bodies))()
+        for r, force in self._keep.items():
+            self.records[r] = force.record
 
 
 def record_size(components: int, record: int, balanced: bool) -> tuple[int, int, int]:
@@ -91,18 +62,15 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
         slow: Components of ν differ in η/ρ̄, lack inertia, or are coupled by Ω or η.
     """
     disc, scene = kernels.disc, kernels.action.scene
-    place = slots(kernels) if method.balanced else []
-    count, values = (references(kernels) if method.balanced else 0), has_values(kernels)
     exact = method.schedule == "exact"
     coefficients = len(kernels.densities.coefficients)
     defines = {
         "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
         "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1, "COEFFICIENTS": coefficients,
-        "REFERENCES": count, "BALANCED": int(bool(method.balanced)), "DAMPED": int(damped),
+        "BALANCED": int(bool(method.balanced)), "DAMPED": int(damped),
         "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
         "CORRECTED": int(bool(method.corrected)), "PACKED": packed_size(kernels),
-        "CHUNK": CHUNK, "STRESSES": max(place, default=-1) + 1,
-        "PLACES": "{" + ", ".join(map(str, place)) + "}",
+        "CHUNK": CHUNK,
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
     files = ("vectors.h", "tabulated.h", "drifts.h", "events.h")
@@ -111,7 +79,7 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
         parts.append(native.template("lone.h"))
     cases = ""
     for r, region in enumerate(regions(kernels)):
-        forms = f"(s)->forms + {2 * r}"
+        forms = f"(s)->forms + {r}"
         if exact:
             arguments = f"{forms}, s, c, cell, t, soft, count, out"
             call = f"tabulated_lone({arguments})"
@@ -119,18 +87,16 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
                 parts.append(region.lone(bool(method.corrected)))
                 call = f"lone_{r}(s, c, b, k, t, soft, out)"
         elif region is not None:
-            parts.append(region.event(place, values))
-            call = f"event_{r}(blocks, c, g, k, held, s, w, mode)"
+            parts.append(region.event(bool(method.balanced)))
+            call = f"event_{r}(blocks, c, g, k, held, blend, s, h, mode)"
         else:
-            arguments = f"{forms}, {forms} + 1, blocks, first, c, g, held, s, w, mode"
-            call = f"tabulated_event({arguments})"
+            call = f"tabulated_event({forms}, blocks, first, c, held, blend, s, h, mode)"
         cases += f"case {r}: {call}; break; "
-    head = "EVENT(region, blocks, first, c, g, k, held, s, w, mode)"
+    head = "EVENT(region, blocks, first, c, g, k, held, blend, s, h, mode)"
     if exact:
         head = "LONE(region, s, c, cell, b, k, t, soft, count, out)"
     parts += [f"#define {head} switch (region) {{ {cases}}}", native.template("events.c")]
     library = native.load("\n".join([*parts, native.template("exact.c") if exact else ""]))
-    library.cb_change_rates.restype = ctypes.c_double
     return library
 
 

@@ -178,14 +178,11 @@ class RegionSource:
             ],
         )
 
-    def _force_lines(
-        self, between: list[str], with_values: bool = False, weight: str = ""
-    ) -> list[str]:
+    def _force_lines(self, between: list[str], weight: str = "") -> list[str]:
         """Statements from gradients g, positions q to nodal forces f0 … fd.
 
         Args:
-            between: Statements between stresses (s_, and the mean self-action z) and forces.
-            with_values: Provide z = √|K| (H_vG G + H_vv mean), for ``between``.
+            between: Statements between stresses s_ and forces.
             weight: A factor of forces that come of values alone, in C.
         """
         d, n = self.dim, self.n
@@ -193,7 +190,7 @@ class RegionSource:
         vv = {k: e for k, e in self.total.items() if k[0] in vals and k[1] in vals}
         rest = {k: e for k, e in self.total.items() if k not in vv}
         mixed = any(k[0] in vals or k[1] in vals for k in rest)
-        own = mixed or with_values
+        own = mixed
         body: list[str] = []
         if vv or own:
             body += [f"const vec r = b[{d * d}];", *self._mean_lines()]
@@ -206,13 +203,6 @@ class RegionSource:
         if mixed:
             outputs = [f"p[{i}]" for i in range(n)]
             body += straight_line(rest, vals, columns, self._inputs(True), outputs, "z")
-        if with_values:
-            body.append("vec z[NR] = {{0}};")
-            if vv:
-                outputs = [f"z[{i}]" for i in range(n)]
-                means = [f"m{i}" for i in range(n)]
-                body += straight_line(vv, vals, vals, means, outputs, "k_")
-            body += [f"z[{i}] += p[{i}];" for i in range(n)]
         body += [f"p[{i}] *= r / {d + 1}.0;" for i in range(n)] if mixed else []
         body += between
         body += [f"vec f{a}[NR] = {{{{0}}}};" for a in range(d + 1)]

@@ -200,7 +200,8 @@ def test_as_published():
     "options, word",
     [
         ({"schedule": "exact", "balanced": True}, "balanced"),
-        ({"start": "one-sided", "balanced": True}, "both ends"),
+        ({"start": "one-sided", "schedule": "octaves", "balanced": True}, "half a step on"),
+        ({"schedule": "windows", "balanced": True}, "differ by two"),
         ({"corrected": True}, "corrected"),
         ({"steps": np.ones(3)}, "schedule='exact'"),
         ({"schedule": "heap"}, "windows, exact, octaves"),

@@ -30,7 +30,7 @@ def variation(plain):
 def bounds(plain, until):
     """What pV lies between for T_Θ → 0: ∫ |q̈| of the solution, and all that acts, each by itself.
 
-    A node's rate jumps by what each of its cells gives, by the reference's force, and by damping.
+    A node's rate changes by what each of its cells gives, together or apart, and by damping.
     """
     solve, nodes = semidiscrete(plain), range(plain.size)
     times = (np.arange(400) + 0.5) * until / 400
@@ -38,16 +38,10 @@ def bounds(plain, until):
     for t in times:
         q, v = solve(t)
         forces = [p.force(q[c]) for c, p in zip(plain.cells, plain.potentials, strict=True)]
-        against = [np.zeros_like(f) for f in forces]
-        if plain.balanced:
-            keep = plain.q
-            plain.q, plain.old = q, None
-            against = plain._set_reference()
-            plain.q, plain.old = keep, None
-        parts = [abs(f - r) for f, r in zip(forces, against, strict=True)]
-        force, own, load = plain._assemble(forces), plain._assemble(against), plain.load(t)
-        apart = plain._assemble(parts)
-        apart += abs(own + load) if plain.balanced else abs(load)
+        # Balanced forces act together all the time; kicks come one by one.
+        parts = [f if plain.balanced else abs(f) for f in forces]
+        force, load = plain._assemble(forces), plain.load(t)
+        apart = abs(plain._assemble(parts) + load) if plain.balanced else plain._assemble(parts) + abs(load)
         for a in nodes:
             m, d = (np.diag(getattr(plain.nodes[a], name)) for name in "MD")
             ix = plain.free[a]
@@ -68,10 +62,10 @@ def test_variation_of_rates(scheme, balanced):
     case = Case(1, 1, 1, (0.8,), (1.7,), potential=True)
     mesh, until, found = graded(MPI.COMM_SELF, 1, 6, seed=4), 0.7, []
     for safety in (0.4, 0.2, 0.1, 0.05):
-        method = cb.AVI(safety, balanced=balanced, dissipation=scheme, filter=0.0)
+        method = cb.AVI(safety, balanced=balanced, dissipation=scheme)
         run = prepared(build(MPI.COMM_SELF, case, mesh), method, until)
         plain = reference(run, case)
-        assert 2 < run.time_sets.asynchronicity < 10
+        assert 2 <= run.time_sets.asynchronicity < 10
         least, most = bounds(plain, until)
         plain.log, windows = [], round(until / run.step)
         run.advance(windows)
@@ -80,7 +74,7 @@ def test_variation_of_rates(scheme, balanced):
         found.append(variation(plain))
     found = np.array(found)
     assert np.all(found <= most), (found, most)
-    assert np.all(found[-1] >= 0.98 * least), (found, least)
+    assert np.all(found[-1] >= 0.95 * least), (found, least)
     # It settles: another half of the step changes less and less.
     assert np.all(abs(found[-1] - found[-2]) < 0.03 * found[-1]), found
 
@@ -131,7 +125,7 @@ def test_momenta(comm, kind, scheme, own, balanced):
     """u keeps its momentum; that of ν decays as the solution's, with "exact" to round-off."""
     until, errors, steps = 0.8, [], []
     for safety in (0.3, 0.15):
-        method = cb.AVI(safety, balanced=balanced, dissipation=scheme, filter=0.1)
+        method = cb.AVI(safety, balanced=balanced, dissipation=scheme)
         run = prepared(free_body(comm, kind, own), method, until)
         assert run.time_sets.asynchronicity > 2
         before, position, _ = totals(run)

@@ -21,7 +21,9 @@ from verification.windows_reference import Quadratic, Quartic, Windows
 import complexbody as cb
 from complexbody import _compat, meshes, native
 from complexbody.integrators.asynchronous import AVI
-from complexbody.integrators.window_run import KEEP, WindowRun
+from complexbody.integrators.balance import BEGIN, blending, component_rates, coupling
+from complexbody.integrators.window_run import WindowRun
+from complexbody.integrators.windows import divisions
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps, critical_step
 
@@ -165,6 +167,18 @@ def divisions_of(run):
     return np.concatenate(disc.comm.allgather(out))
 
 
+def blend_of(run):
+    """k of all cells and components, in the order of ``whole``; what it should be is another test."""
+    disc, balance = run.problem.disc, run.balance
+    if balance is None:
+        return None
+    out = np.zeros((disc.count, disc.n))
+    for i in range(run.plan.count):
+        cells = disc.source_cell[run.plan.groups[i].first : run.plan.groups[i].last]
+        out[cells[cells >= 0]] = balance.blend[i, : disc.n]
+    return np.concatenate(disc.comm.allgather(out))
+
+
 def traction_nodes(points, cells):
     """∫N_a over the side x = 1."""
     out, dim = np.zeros(len(points)), points.shape[1]
@@ -235,8 +249,8 @@ def reference(run, case, make=None):
         "scheme": method.dissipation,
     }  # fmt: skip
     out = make(**given) if make else Windows(
-        divisions=divisions_of(run), balanced=method.balanced, passes=method.passes,
-        filter=method.filter, start=method.start, **given,
+        divisions=divisions_of(run), balanced=method.balanced, blend=blend_of(run),
+        start=method.start, **given,
     )  # fmt: skip
     if case.loads:
         side, zero = traction_nodes(points, cells), np.zeros((len(points), n))
@@ -305,7 +319,7 @@ def test_trajectories(comm, name, scheme, balanced):
     run = prepared(build(comm, case), AVI(dissipation=scheme, balanced=balanced), 10.0)
     plain = reference(run, case)
     counts = set(plain.divisions.tolist())
-    assert len(counts) > 2 and min(counts) == 1, counts
+    assert len(counts) > 1 + (not balanced) and min(counts) <= 2, counts
     compare(run, plain, 5)
 
 
@@ -331,18 +345,34 @@ def test_lanes(comm, monkeypatch, name, balanced, lanes):
     compare(run, reference(run, case), 3)
 
 
-@pytest.mark.parametrize("passes, strength, safety", [(1, 0.0, 0.3), (3, 0.02, 0.45), (2, 0.5, 0.6)])
-def test_options(comm, passes, strength, safety):
-    """Passes, filter and safety are what the run is told; N_K = ⌈W/(α h_K)⌉."""
+@pytest.mark.parametrize("safety", [0.3, 0.45, 0.6])
+@pytest.mark.parametrize("schedule", ["windows", "octaves"])
+def test_options(comm, schedule, safety):
+    """N_K = ⌈W/(α h_K)⌉; octaves: a power of two, no larger than it or half a neighbour's asks for."""
     case = CASES["n4 unequal rates"]
-    method = AVI(passes=passes, filter=strength, safety=safety)
-    run = prepared(build(comm, case), method, 10.0)
+    scene = build(comm, case, graded(comm, 2, (7, 3), amount=0.35, pull=3.0))
+    run = prepared(scene, AVI(schedule=schedule, safety=safety), 10.0)
+    assert run.method.balanced == (schedule == "octaves")
     disc, critical = run.problem.disc, cell_steps(run.problem)
     real = disc.source_cell >= 0
     allowed, group = safety * critical[real], np.repeat(disc.group, disc.lanes)[real.ravel()]
     longest = comm.allreduce(allowed.max(initial=0), MPI.MAX)
     assert run.step == pytest.approx(10.0 / np.ceil(10.0 / longest))
-    assert np.array_equal(group, np.ceil(run.step / allowed * (1 - 1e-9)))
+    counts = np.ceil(run.step / allowed * (1 - 1e-9))
+    if schedule == "windows":
+        assert np.all((group == counts) | (counts > 16)) and np.all(group >= counts)
+    else:
+        counts = 2 ** np.ceil(np.log2(counts))
+        assert np.all(group >= counts) and np.all(np.log2(group) % 1 == 0)
+        number, (_, cells) = divisions_of(run), whole(run.problem.scene.mesh)
+        most = np.zeros(cells.max() + 1)
+        np.maximum.at(most, cells.ravel(), np.repeat(number, cells.shape[1]))
+        beside = most[cells].max(axis=1) / 2
+        own = np.zeros(disc.count)
+        own[disc.source_cell[real]] = counts
+        own = np.concatenate(comm.allgather(own))
+        assert np.all(number >= beside) and np.all((number == own) | (number == beside))
+        assert np.any(number > own)
     compare(run, reference(run, case), 4)
 
 
@@ -424,7 +454,7 @@ def test_touches_without_forces(comm, scheme, balanced):
     for one in (MPI.COMM_SELF, comm):
         mesh = graded(one, 2, (7, 5))
         scene = cb.Scene(mesh, body, initial=cb.Initial(nu_dot=1.0))
-        run = prepared(scene, AVI(dissipation=scheme, balanced=balanced, filter=0.0), 10.0)
+        run = prepared(scene, AVI(dissipation=scheme, balanced=balanced), 10.0)
         assert run.time_sets.asynchronicity > 3
         run.advance(2)
         states.append((whole(mesh)[0], *state(run)))
@@ -444,7 +474,7 @@ def test_momentum(comm, balanced):
     """A free body keeps its linear momentum, also where its density varies."""
     case = replace(CASES["n6 regions"], potential=False, loads=False, supports="none")
     for chosen in (case, replace(case, varying=True)):
-        run = prepared(build(comm, chosen), AVI(balanced=balanced, filter=0.1), 10.0)
+        run = prepared(build(comm, chosen), AVI(balanced=balanced), 10.0)
         before = run.entries().momentum
         run.advance(10)
         change = comm.allreduce(run.entries().momentum - before)
@@ -514,26 +544,31 @@ SIDES = (cb.Fix("u", "boundary"), cb.Fix("nu", "boundary"))
 
 
 def mode_error(run, viscosity):
-    """L2 errors (lumped) of q and q̇ of a standing mode; collective."""
-    disc, comm, dim = run.problem.disc, run.problem.comm, run.problem.disc.dim
+    """Errors of q of a standing mode, L2 (lumped) and energy norm."""
+    problem, disc, dim = run.problem, run.problem.disc, run.problem.disc.dim
     stiff = STIFF * dim * np.pi**2 + np.diag([0, OWN])
     zero, eye = np.zeros((2, 2)), np.eye(2)
     rates = np.block([[zero, eye], [-stiff, -np.diag([0, viscosity])]])
     exact = scipy.linalg.expm(run.time * rates) @ [1.0, 0.5, 0, 0]
     mode = np.prod(np.sin(np.pi * disc.position[:-1, :dim]), axis=1)
-    weight = (disc.volume * disc.owned)[:, None]
-    squares = [
-        np.sum((values[:-1, :2] - np.outer(mode, wanted)) ** 2 * weight)
-        for values, wanted in zip(run.sample(), (exact[:2], exact[2:]), strict=True)
-    ]
-    return np.sqrt(comm.allreduce(np.array(squares)))
+    wrong = run.sample()[0][:-1, :2] - np.outer(mode, exact[:2])
+    problem.kernels.x[:] = 0.0
+    problem.kernels.x[:-1, :2] = wrong
+    return np.sqrt([np.sum(wrong**2 * disc.volume[:, None]), 2 * problem.kernels.energies().sum()])
 
 
 @pytest.mark.serial
 @pytest.mark.parametrize("viscosity", [0.0, 2.0])
-@pytest.mark.parametrize("dim, sizes, until", [(1, (25, 50, 100, 200), 3.0), (2, (10, 20, 40, 80), 1.3)])
-def test_refinement_at_fixed_safety(comm, dim, sizes, until, viscosity):
-    """Balanced windows are as accurate as one step for all; plain ones stop converging."""
+@pytest.mark.parametrize(
+    "dim, sizes, until, best",
+    [(1, (25, 50, 100, 200), 3.0, 1.95), (2, (10, 20, 40, 80), 1.3, 0.85), (3, (4, 8, 16), 1.3, 1.3)],
+)
+def test_refinement_at_fixed_safety(comm, dim, sizes, until, best, viscosity):
+    """Balanced windows are as accurate as one step for all, in both norms; plain ones are not.
+
+    ``best`` is the order in the energy norm that one step has: interpolation's, but for 1D and
+    meshes as coarse as in 3D.
+    """
     methods = {"one step": cb.Synchronous(), "plain": AVI(balanced=False), "balanced": AVI()}
     errors = {name: [] for name in methods}
     for size in sizes:
@@ -541,21 +576,24 @@ def test_refinement_at_fixed_safety(comm, dim, sizes, until, viscosity):
             if dim == 1:
                 lengths = np.random.default_rng(size).uniform(1, 3, size)
                 mesh = meshes.graded_interval(comm, lengths / lengths.sum())
-            else:
+            elif dim == 2:
                 mesh = meshes.jiggled(meshes.rectangle(comm, (0, 0), (1, 1), size), 0.25, 3)
+            else:
+                mesh = meshes.jiggled(meshes.box(comm, [0] * 3, [1] * 3, size), 0.2, 3)
             initial = cb.Initial(
                 *(lambda x, a=a: a * np.prod(np.sin(np.pi * x[:dim]), axis=0) for a in (1.0, 0.5))
             )
             run = prepared(cb.Scene(mesh, pair(dim, viscosity), SIDES, (), initial), method, until)
             run.advance(round(until / run.step))
-            errors[name].append(mode_error(run, viscosity)[0])
+            errors[name].append(mode_error(run, viscosity))
     errors = {name: np.array(found) for name, found in errors.items()}
     told = f"{errors}"
-    order = -np.polyfit(np.log(sizes), np.log(errors["balanced"]), 1)[0]
-    assert order >= 1.9, told
+    slope, alone = (np.log2(errors[name][-2] / errors[name][-1]) for name in ("balanced", "one step"))
+    assert slope[0] >= min(1.95, alone[0] - 0.03) and slope[1] >= best, f"{slope} {alone} {told}"
     assert np.all(errors["balanced"] <= 1.3 * errors["one step"]), told
-    assert errors["plain"][-1] > 0.5 * errors["plain"][-2], told
-    assert errors["plain"][-1] > 3 * errors["balanced"][-1], told
+    if dim < 3:
+        assert errors["plain"][-1, 0] > 0.5 * errors["plain"][-2, 0], told
+        assert np.all(errors["plain"][-1] > np.array([3, 1.5]) * errors["balanced"][-1]), told
 
 
 @pytest.mark.serial
@@ -572,7 +610,7 @@ def test_steps_to_zero(scheme, balanced, order):
     mesh = graded(MPI.COMM_SELF, 1, 6, seed=4)
     errors, steps, until = [], [], 0.7
     for safety in (0.2, 0.1, 0.05):
-        method = AVI(dissipation=scheme, balanced=balanced, safety=safety, filter=0.0)
+        method = AVI(dissipation=scheme, balanced=balanced, safety=safety)
         run = prepared(build(MPI.COMM_SELF, case, mesh), method, until)
         plain = reference(run, case)
         solve = semidiscrete(plain)
@@ -630,31 +668,55 @@ def semidiscrete(plain):
 
 
 def window_map(run):
-    """The matrix of one window on (q, q̇, q a window before) of the free components."""
-    problem = run.problem
-    n, record = problem.disc.n, problem.disc.record
-    rows, columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
-    balanced = run.method.balanced
-    parts, size = 2 + balanced, len(rows)
+    """The matrix of one window on (q, q̇) of the free components and, balanced, the held forces.
 
-    def put(q, v):
+    A cell's forces are those of some displacement of its nodes: of all others it never holds any.
+    """
+    problem, balance = run.problem, run.balance
+    disc, n, record = problem.disc, problem.disc.n, problem.disc.record
+    rows, columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
+    size, held = len(rows), []
+    if balance is not None:
+        for block, lane in np.argwhere(disc.source_cell >= 0):
+            held += [(block, lane, basis) for basis in force_basis(run, block, lane)]
+
+    def put(q, v, F):
         run.record[:-1, :n] = run.record[:-1, record : record + n] = 0.0
         run.record[rows, columns], run.record[rows, record + columns] = q, v
         run.record[:, run._time] = run.time
+        if balance is not None:
+            balance.held[:], total = 0.0, np.zeros((disc.nodes + 1, record))
+            run.record[:-1, 2 * record : 2 * record + n] = 0.0
+            for (block, lane, basis), part in zip(held, F, strict=True):
+                if part:
+                    balance.held[block, :, lane] += part * basis
+                    np.add.at(total[:, :n], disc.cells[block, :, lane], part * basis.reshape(-1, n))
+            run.c.cb_accelerate(run._world, native.pointer(total))
 
-    out = np.zeros((parts * size, parts * size))
-    for j, unit in enumerate(np.eye(parts * size).reshape(-1, parts, size)):
+    out = np.zeros((2 * size + len(held),) * 2)
+    for j, unit in enumerate(np.eye(len(out))):
         run.steps = 1
-        for q, kept in ((unit[-1], "old"), (unit[0], "stress")) if balanced else ():
-            put(q, 0.0)
-            run._together(run.time, KEEP, 0.0)
-            np.copyto(getattr(run.balance, kept), run.balance.stress)
-        put(unit[0], unit[1])
+        put(unit[:size], unit[size : 2 * size], unit[2 * size :])
         run.advance(1)
         out[:size, j] = run.record[rows, columns]
         out[size : 2 * size, j] = run.record[rows, record + columns]
-        out[2 * size :, j] = unit[0] if balanced else ()
+        out[2 * size :, j] = [balance.held[m, :, lane] @ basis for m, lane, basis in held]
     return out
+
+
+def force_basis(run, block, lane):
+    """Orthonormal forces that a cell can hold, shape (rank, (d+1)·n)."""
+    disc, balance, rows = run.problem.disc, run.balance, []
+    nodes, n = disc.cells[block, :, lane], disc.n
+    group = next(i for i in range(run.plan.count) if block < run.plan.groups[i].last)
+    for a, i in itertools.product(nodes, range(n)):
+        run.record[:-1, :n] = 0.0
+        run.record[a, i] = 1.0
+        run.record[:, run._time] = run.time
+        run._together(run.time, BEGIN, first=group, last=group + 1)
+        rows.append(balance.held[block, :, lane].copy())
+    values, basis = np.linalg.svd(rows)[1:]
+    return basis[: np.count_nonzero(values > 1e-10 * values[0])]
 
 
 def radius(run):
@@ -785,14 +847,108 @@ QUICK = ("1D, sizes in [1, 3], 0", "1D, graded by 10", "2D, scattered, 0", "3D, 
 SLOW = [pytest.param(n, marks=[] if n in QUICK else pytest.mark.slow, id=n) for n in SAMPLES]
 
 
+def sample(name, coupled, viscosity=0.0):
+    """A scene of the pair, or of u alone, on one of the meshes."""
+    mesh = SAMPLES[name]()
+    supports = [cb.Fix("u", LEFT), cb.Fix("nu", "boundary" if coupled else EVERYWHERE)]
+    return cb.Scene(mesh, pair(mesh.geometry.dim, viscosity), supports)
+
+
 @pytest.mark.serial
 @pytest.mark.parametrize("coupled", [False, True], ids=["one field", "pair"])
 @pytest.mark.parametrize("name", SLOW)
-def test_no_growth(name, coupled):
-    """Balanced windows at their defaults: no mode of a linear body grows."""
-    mesh = SAMPLES[name]()
-    body = pair(mesh.geometry.dim)
-    supports = [cb.Fix("u", LEFT), cb.Fix("nu", "boundary" if coupled else EVERYWHERE)]
-    run = prepared(cb.Scene(mesh, body, supports), AVI(), 1e3)
-    growth = radius(run) - 1
+@pytest.mark.parametrize("safety", [0.45, 0.6])
+def test_no_growth(name, coupled, safety):
+    """Balanced windows: no mode of a linear body grows, at the default α and well above it."""
+    if coupled and name.startswith("3D"):
+        pytest.skip("a matrix of 3000 rows")
+    growth = radius(prepared(sample(name, coupled), AVI(safety=safety), 1e3)) - 1
     assert growth <= 1e-10, f"{growth:.1e} per window"
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("viscosity", [0.3, 3.0, 30.0, 300.0])
+@pytest.mark.parametrize("coupled", [0.0, 0.03, 0.3])
+@pytest.mark.parametrize("name", ["1D, sizes in [1, 10], 0", pytest.param("2D, scattered, 0", marks=pytest.mark.slow)])
+def test_no_growth_damped(monkeypatch, name, coupled, viscosity):
+    """Viscosity of ν, weakly or not at all coupled to u: alternating errors of held forces decay."""
+    monkeypatch.setattr(f"{__name__}.STIFF", np.array([[1.0, coupled], [coupled, 0.6]]))
+    run = prepared(sample(name, True, viscosity), AVI(), 1e3)
+    assert radius(run) - 1 <= 1e-10
+    if coupled and viscosity < 100:
+        run.balance.blend[:] = 0.0
+        assert radius(run) - 1 > 1e-5  # without it they grow
+
+
+@pytest.mark.serial
+def test_neighbours_within_two():
+    """Where neighbours' steps differ by more, balanced windows may grow fast: why octaves are graded."""
+    run = prepared(sample("1D, sizes in [1, 30], 2", True), AVI(), 1e3)
+    assert radius(run) - 1 <= 1e-10
+    scene = sample("1D, sizes in [1, 30], 2", True)
+    problem = Problem(scene)
+    critical = cell_steps(problem)
+    real = problem.disc.source_cell >= 0
+    steps = np.zeros(problem.disc.count)
+    steps[problem.disc.source_cell[real]] = 0.45 * critical[real]
+    problem.arrange(divisions(steps, run.step, octaves=True))
+    assert radius(WindowRun(problem, AVI(), run.step, steps)) - 1 > 0.1
+
+
+@pytest.mark.parametrize("name", ["n2 plane", "n4", "n6", "quartic", "quartic line"])
+def test_reversible(comm, name):
+    """Back in time the way it came: held forces F are half a step on, hence 2f − F backwards."""
+    case = replace(CASES[name], viscosity=(0.0,), loads=False)
+    run = prepared(build(comm, case), AVI(), 10.0)
+    disc, balance = run.problem.disc, run.balance
+    n, record = disc.n, disc.record
+    run.advance(1)
+    start, held = [part.copy() for part in state(run)], balance.held.copy()
+    run.advance(12)
+    moved = state(run)[0] - start[0]
+    # Held forces of the steps that led here: f itself comes of an event without effect.
+    now, keep = balance.held.copy(), run.record.copy()
+    run._together(run.time, BEGIN, 0.0)
+    force = balance.held.copy()
+    run.record[:] = keep
+    balance.held[:] = 2 * force - now
+    run.record[:, record : record + n] *= -1.0
+    change = np.zeros((disc.nodes + 1, record))
+    for a in range(disc.dim + 1):
+        part = (balance.held - now)[:, a * n : (a + 1) * n, :]
+        np.add.at(change[:, :n], disc.cells[:, a, :], part.transpose(0, 2, 1))
+    disc.sum_shared(change[:-1])
+    run.c.cb_accelerate(run._world, native.pointer(change))
+    run.advance(12)
+    fields, rates = state(run)
+    assert abs(fields - start[0]).max() < 1e-10 * abs(moved).max()
+    assert abs(rates + start[1]).max() < 1e-10 * abs(start[1]).max()
+    assert everywhere(comm, abs(balance.held - held).max(initial=0) > 1e-3 * abs(held).max(initial=0))
+
+
+@pytest.mark.serial
+@pytest.mark.parametrize("name", ["n4", "quartic", "quartic line"])
+def test_energy(comm, name):
+    """Energy neither drifts nor wanders over thousands of windows, from rough data."""
+    case = replace(CASES[name], viscosity=(0.0,), loads=False)
+    run = prepared(build(comm, case), AVI(), 1e3)
+    energies = []
+    for _ in range(60):
+        run.advance(50)
+        e = run.entries()
+        energies.append(e.kinetic_u + e.kinetic_nu + e.stored + e.potential)
+    energies = np.array(energies) / energies[0] - 1
+    assert abs(energies).max() < 0.08
+    assert abs(energies[:30].mean() - energies[30:].mean()) < 0.01
+
+
+def test_blending():
+    """k = min(1, hη/ρ̄), and C²z/(1 + z²) of what a component is coupled to."""
+    coupled = np.array([[0.0, 0.1, 0.0], [0.1, 0.0, 0.5], [0.0, 0.5, 0.0]])
+    rates = np.array([0.0, 2.0, 0.0])
+    assert blending(rates, coupled, 0.1) == pytest.approx([0.1 * 0.2 / 1.04, 0.2, 0.5 * 0.2 / 1.04])
+    assert blending(np.array([0.0, np.inf, 3.0]), coupled, 1.0) == pytest.approx([0.0, 1.0, 1.0])
+    scene = cb.Scene(lines(0, 3), pair(1, 2.0))
+    problem = Problem(scene)
+    assert coupling(problem, 0) == pytest.approx(np.array([[0, 0.15], [0.15, 0]]))
+    assert component_rates(problem, 0) == pytest.approx([0.0, 2.0])

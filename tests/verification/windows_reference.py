@@ -57,16 +57,6 @@ class Quadratic:
         """−∂V_K of its quadratic part at the nodal values q, shape (d+1, n)."""
         return -(self.K @ q.ravel()).reshape(q.shape)
 
-    def stress(self, q):
-        """Mean of (P, z) over the cell: shapes (n, d), (n,)."""
-        nd = self.n * self.B.shape[1]
-        g = self.H @ (self.G @ q.ravel())
-        return g[:nd].reshape(self.n, -1), g[nd:]
-
-    def nodal(self, P, z):
-        """−∫ P·∇N_a + z N_a of constant stresses, shape (d+1, n)."""
-        return -self.volume * (self.B @ P.T + z / len(self.B))
-
 
 class Quartic(Quadratic):
     """½ g·Hg + ¼ b ν₀⁴ + c ν₀² U₀₀ + ¼ s U₀₀⁴: everything by hand, integrated exactly.
@@ -101,14 +91,6 @@ class Quartic(Quadratic):
             z = b * self.moment(nu, nu, nu, shape) + 2 * c * U * self.moment(nu, shape)
             out[a, self.at] -= self.volume * z
         return out
-
-    def stress(self, q):
-        """Means of both parts."""
-        (b, c, s), nu, (P, z) = self.numbers, q[:, self.at], super().stress(q)
-        U = float(self.B[:, 0] @ q[:, 0])
-        P[0, 0] += c * self.moment(nu, nu) + s * U**3
-        z[self.at] += b * self.moment(nu, nu, nu) + 2 * c * U * self.moment(nu)
-        return P, z
 
 
 # --- one node between kicks ----------------------------------------------------------------------
@@ -225,29 +207,29 @@ class Windows:
         fixed: Prescribed components (nodes, n).
         targets: Prescribed values (nodes, n) as a function of t; by default they stay.
         loads: Pairs of nodal forces (nodes, n) and a factor as a function of t.
-        balanced, passes, filter, scheme, start: As for cb.AVI.
+        balanced, scheme, start: As for cb.AVI.
+        blend: k of each cell and component (cells, n), if balanced.
     """
 
     def __init__(
         self, cells, potentials, divisions, window, masses, viscosities, q, rates, fixed=None,
-        targets=None, loads=(), balanced=True, passes=2, filter=0.01, scheme="exact",
+        targets=None, loads=(), balanced=True, blend=None, scheme="exact",
         start="trapezoidal",
     ):  # fmt: skip
         self.cells, self.potentials, self.divisions = cells, potentials, divisions
-        self.window, self.balanced, self.passes, self.epsilon = window, balanced, passes, filter
+        self.window, self.balanced, self.blend = window, balanced, blend
         # One-sided: what acts at a window's start acts with its whole step, nothing at its end.
         self.first = 1.0 if start == "one-sided" else 0.5
         self.size, self.n = q.shape
         self.fixed = np.zeros(q.shape, bool) if fixed is None else fixed
         self.loads = [*loads, (self._assemble([p.constant for p in potentials]), lambda t: 1.0)]
-        self.q, self.count, self.old, self.log = q.copy(), 0, None, None
+        self.q, self.count, self.held, self.log = q.copy(), 0, None, None
         start = self.q.copy()
         self.targets = (lambda t: start) if targets is None else targets
         self.q[self.fixed] = self.targets(0.0)[self.fixed]
         self.speed = np.zeros(q.shape)  # of prescribed components
         self.F, self.p = np.zeros(q.shape), np.zeros(q.shape)
         share = [p.volume / cells.shape[1] for p in potentials]
-        self.densities = [m[0, 0] for m in masses]  # u comes first
         self.volume = np.zeros(self.size)
         M, D = np.zeros((2, self.size, self.n, self.n))
         for c, s, m, d in zip(cells, share, masses, viscosities, strict=True):
@@ -285,33 +267,38 @@ class Windows:
         W, start = self.window, self.time
         self.clock = [Fraction(0)] * self.size  # in windows
         self.speed = np.where(self.fixed, (self.targets(start + W) - self.q) / W, 0.0)
-        zero = [np.zeros_like(p.constant) for p in self.potentials]
         if self.balanced:
-            against = self._set_reference()
-            self.F = self._assemble(against) + self.load(start + W / 2)
+            if self.count == 0:
+                self._begin()
+            self.F = self._assemble(self.held) + self.load(start + W / 2)
         else:
-            against = zero
             self._kick_nodes(self.first * W * self.load(start))
-        for K, N in enumerate(self.divisions):
-            self._act(K, Fraction(0), self.first * W / N, against)
+            for K, N in enumerate(self.divisions):
+                self._act(K, Fraction(0), self.first * W / N)
         heap = [(Fraction(1, int(N)), K, 1) for K, N in enumerate(self.divisions) if N > 1]
         heapq.heapify(heap)
         while heap:
             t, K, j = heapq.heappop(heap)
             N = int(self.divisions[K])
-            self._act(K, t, W / N, against)
+            self._act(K, t, W / N)
             if j + 1 < N:
                 heapq.heappush(heap, (Fraction(j + 1, N), K, j + 1))
         for K, N in enumerate(self.divisions):
-            if self.first == 0.5:
-                self._act(K, Fraction(1), W / N / 2, against)
+            if self.balanced or self.first == 0.5:
+                self._act(K, Fraction(1), W / N if self.balanced else W / N / 2)
         for a in range(self.size):
             self._drift(a, Fraction(1))  # nodes of no cell would be left behind
         self.count += 1
         if not self.balanced:
             self._kick_nodes((1 - self.first) * W * self.load(self.time))
-        elif self.epsilon > 0:
-            self._filter()
+
+    def _begin(self):
+        """Forces of the first steps: half a step on, moving evenly."""
+        rates = self.moving_rates()
+        self.held = [
+            p.force(self.q[c] + self.window / N / 2 * rates[c])
+            for c, p, N in zip(self.cells, self.potentials, self.divisions, strict=True)
+        ]
 
     def _drift(self, a, t):
         dt = float(t - self.clock[a]) * self.window
@@ -327,50 +314,23 @@ class Windows:
             self.log.append((a, began, began + dt, self.q[a].copy(), (self.q[a] - before) / dt))
         self.clock[a] = t
 
-    def _act(self, K, t, h, against):
+    def _act(self, K, t, h):
         nodes = self.cells[K]
         for a in nodes:
             self._drift(a, t)
-        kick = h * (self.potentials[K].force(self.q[nodes]) - against[K])
+        force = self.potentials[K].force(self.q[nodes])
+        kick = h * force
+        if self.balanced:
+            before, k = self.held[K], self.blend[K]
+            self.held[K] = (2 - k) * force - (1 - k) * before
+            kick = h * (force - (self.held[K] + before) / 2)
+            for a, part in zip(nodes, self.held[K] - before, strict=True):
+                self.F[a] += part
         for a, part in zip(nodes, kick, strict=True):
             self.p[a] += np.where(self.fixed[a], 0.0, part)
 
     def _kick_nodes(self, impulse):
         self.p += np.where(self.fixed, 0.0, impulse)
-
-    def _set_reference(self):
-        """Forces of the reference stress on each cell's nodes."""
-        now = [p.stress(self.q[c]) for c, p in zip(self.cells, self.potentials, strict=True)]
-        old = now if self.old is None else self.old
-        self.old = now
-        values = [
-            np.column_stack([P, z]) + 0.5 * (np.column_stack([P, z]) - np.column_stack([Q, y]))
-            for (P, z), (Q, y) in zip(now, old, strict=True)
-        ]
-        for _ in range(self.passes):
-            above, below = np.zeros((self.size, *values[0].shape)), np.zeros(self.size)
-            for c, p, value in zip(self.cells, self.potentials, values, strict=True):
-                for a in c:
-                    above[a] += p.volume * value
-                    below[a] += p.volume
-            nodal = above / below[:, None, None]
-            values = [nodal[c].mean(axis=0) for c in self.cells]
-        return [p.nodal(v[:, :-1], v[:, -1]) for p, v in zip(self.potentials, values, strict=True)]
-
-    def smoothing(self):
-        """S as a matrix: nodal values → means of cells → averages at nodes, weighted by mass."""
-        S, m = np.zeros((self.size, self.size)), self.cells.shape[1]
-        node_mass = np.zeros(self.size)
-        for c, p, density in zip(self.cells, self.potentials, self.densities, strict=True):
-            S[np.ix_(c, c)] += density * p.volume / m / m
-            node_mass[c] += density * p.volume / m
-        return S / node_mass[:, None]
-
-    def _filter(self):
-        rough = np.linalg.matrix_power(np.eye(self.size) - self.smoothing(), 3)
-        change = rough @ self.moving_rates()
-        for a, ix in enumerate(self.free):
-            self.p[a, ix] -= self.epsilon * self.nodes[a].M @ change[a, ix]
 
     def moving_rates(self):
         """q̇ of what has inertia, or is prescribed, at the last window's end."""
