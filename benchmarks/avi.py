@@ -5,7 +5,7 @@
 
 Same kernel, same graded mesh, one process and core, taken in turn; the least processor time of the
 repeats counts. *Heap* is the AVI of the literature, compiled as well: a binary heap, one cell at a
-time. An event's cost is all in; *of it* tells the shares of reference and filter. Speed-ups over
+time. An event's cost is all in; *of it* tells the share of renewing loads. Speed-ups over
 synchronous stepping at 0.9 of its critical step: *ideal*, every cell at its own critical step;
 *scheduled*, in updates; *realised*, in time. *Set-up* is its share in a run of 1000 windows. Read
 the ratios: a time on its own says nothing.
@@ -38,7 +38,7 @@ METHODS: dict[str, Any] = {
     "exact": AVI(schedule="exact", balanced=False),
 }
 #: Parts of a balanced window whose share is told.
-PARTS = {"set": "reference", "filter": "filter"}
+PARTS = {"load": "loads"}
 UNTIL = 50.0  # long beside any window
 
 TRIAD = """
@@ -88,7 +88,7 @@ void run(const world *s, entry *heap, int64_t cells, const int32_t *nodes, const
       for (int i = 0; i < N; i++) r[i] += dt * r[N + i];
       r[2 * N] = heap->time;
     }
-    event_0(1, c, geometry + k * GEOMETRY, 0, 0, s, step[k], 0);
+    event_0(1, c, geometry + k * GEOMETRY, 0, 0, 0, s, step[k], 0);
     heap->time = ++count[k] * step[k];
     sift(heap, cells, 0);
   }
@@ -128,7 +128,7 @@ class Heap:
         assert region is not None
         defines = {"N": n, "NR": n, "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1, "COEFFICIENTS": 0}
         text = "\n".join(f"#define {key} {value}" for key, value in defines.items())
-        self.c = native.load(text + HEAP % region.event([], False))
+        self.c = native.load(text + HEAP % region.event(False))
         real = disc.source_cell >= 0
         self.step = whole(safety * cell_steps(problem)[real])
         self.nodes = whole(disc.cells.transpose(0, 2, 1)[real])

@@ -21,18 +21,20 @@ longer is zero), so that there it must decay, which a kick makes up for:
 
 from __future__ import annotations
 
-import ctypes
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import native
-from complexbody.integrators.records import RecordRun
 from complexbody.integrators.windows import WindowPlan
 from complexbody.masses import pencil_basis
 from complexbody.problem import Problem
 from complexbody.timesets import initial_matrices
+
+if TYPE_CHECKING:
+    from complexbody.integrators.window_run import WindowRun
 
 Array = npt.NDArray[np.float64]
 BEGIN = 1
@@ -116,7 +118,7 @@ class Balance:
         blend: k of each group (groups, NR).
     """
 
-    def __init__(self, run: RecordRun, plan: WindowPlan) -> None:
+    def __init__(self, run: WindowRun, plan: WindowPlan) -> None:
         self.run, self.plan, problem = run, plan, run.problem
         disc = problem.disc
         self.held = native.aligned((disc.blocks, (disc.dim + 1) * disc.n, disc.lanes))
@@ -124,10 +126,12 @@ class Balance:
         self._load = np.zeros((disc.nodes + 1, disc.record))
         if problem.masses.damped:
             numbers = range(len(problem.scene.bodies))
-            parts = [(component_rates(problem, r), coupling(problem, r)) for r in numbers]
+            rates = [component_rates(problem, r) for r in numbers]
+            coupled = [coupling(problem, r) for r in numbers]
             for i in range(plan.count):
                 group = plan.groups[i]
-                self.blend[i, : disc.n] = blending(*parts[group.region], group.step)
+                r = group.region
+                self.blend[i, : disc.n] = blending(rates[r], coupled[r], group.step)
 
     def begin(self, t: float) -> None:
         """Forces half a step behind t, from positions and rates there: those of the first steps."""
