@@ -4,7 +4,8 @@
     python benchmarks/asynchrony.py [--quick] [--out docs/charts]
 
 The standing wave of precision.py at fixed α (step over critical step). Three parts:
-1. errors under refinement, and cell updates, for one step, plain windows and balanced windows;
+1. errors under refinement, bias of a mode's amplitude beside one step on the same mesh, and cell
+   updates, for one step, plain windows, real steps (published and corrected), balanced windows;
 2. the error of time stepping alone, over α: distance to a run with a tenth of the step on the
    same mesh;
 3. energy over 45 periods of the faster mode and over 100 000 windows, from smooth and from random
@@ -37,10 +38,13 @@ METHODS: dict[str, Any] = {
     "one step, 0.9": Synchronous(),
     "plain, 0.45": AVI(balanced=False),
     "plain, 0.6": AVI(safety=0.6, balanced=False),
+    "published, 0.45": AVI.as_published(),
+    "corrected, 0.45": AVI(schedule="exact"),
     "balanced, 0.45": AVI(),
     "balanced, 0.6": AVI(safety=0.6),
 }
-COLOURS = {"plain": "#d98200", "balanced": "#c2185b", "one step": "#26a"}
+COLOURS = {"plain": "#d98200", "balanced": "#c2185b", "one step": "#26a", "published": "#7a7a7a",
+           "corrected": "#2e8b57"}  # fmt: skip
 Maker = Callable[[int], Any]
 
 
@@ -74,19 +78,30 @@ def refinement(name: str, limit: int) -> list[dict[str, Any]]:
     """Errors and updates of all methods on the meshes of a case, with orders between meshes."""
     wave, sizes, make = CASES[name]
     rows: list[dict[str, Any]] = []
-    print(f"\n{name}\n  {'method':28}N        L2     energy   updates  ratio")
+    print(f"\n{name}\n  {'method':28}N        L2     energy      bias   updates  ratio")
     for label, method in METHODS.items():
         for n in sizes[:limit]:
             problem = Problem(wave.scene(make(n)))
             run, x = end(problem, method)
             l2, energy = wave.errors(problem, x, UNTIL)
-            base = [r for r in rows if r["per_side"] == n]
-            ratio = run.updates / base[0]["updates"] if base else 1.0
+            base = next((r for r in rows if r["per_side"] == n), None)
+            ratio = run.updates / base["updates"] if base else 1.0
+            mode = amplitudes(wave, problem, x)
+            bias = float(np.abs(mode - base["mode"]).max()) if base else 0.0
             rows.append({"case": name, "method": label, "per_side": n, "l2": l2, "energy": energy,
-                         "updates": run.updates, "ratio": ratio})  # fmt: skip
-            print(f"  {label:20}{n:9}{l2:11.2e}{energy:11.2e}{run.updates:10.2e}{ratio:7.2f}")
+                         "mode": mode.tolist(), "bias": bias, "updates": run.updates,
+                         "ratio": ratio})  # fmt: skip
+            print(f"  {label:20}{n:9}{l2:11.2e}{energy:11.2e}{bias:10.1e}{run.updates:10.2e}"
+                  f"{ratio:7.2f}", flush=True)  # fmt: skip
             problem.close()
     return rows
+
+
+def amplitudes(wave: Wave, problem: Problem, x: Array) -> Array:
+    """Amplitudes of (u, ν) in the wave's own shape: the ripple of single nodes averages out."""
+    shape = wave.shape(problem.disc.position[:-1].T)
+    weight = problem.disc.volume * shape
+    return weight @ x[:-1, :2] / (weight @ shape)
 
 
 def of_time(sides: tuple[int, ...], alphas: tuple[float, ...]) -> list[dict[str, Any]]:
@@ -142,24 +157,26 @@ def drift(options: list[tuple[str, Maker, int]], periods: float, long: int) -> l
     wave, rows = Wave(2), []
     A, K, R = precision.A, precision.K, precision.R
     fast = np.pi * math.sqrt(2 * np.linalg.eigvalsh(np.array([[A, R], [R, K]]))[-1])
-    print(f"\nenergy over {periods:g} periods, and over {long} windows: E/E0 − 1, largest and last"
-          "\n  mesh             method            data     periods              windows")  # fmt: skip
+    print(f"\nenergy over {periods:g} periods, and over {long} windows: E/E0 − 1, largest and "
+          "last\n  mesh             method            data     periods              windows"
+          )  # fmt: skip
     for name, make, n in options:
         for label, method in METHODS.items():
             for data, scene in (("smooth", wave.scene), ("random", lambda mesh: rough(wave, mesh))):
                 until = periods * 2 * math.pi / fast
                 some = np.array(energies(scene(make(n)), method, until, 180)) - 1
-                many = some[:1]
-                if label.startswith(("balanced", "one")):
-                    step = method.prepare(Problem(scene(make(n))), until).step
-                    many = np.array(energies(scene(make(n)), method, long * step, 400)) - 1
-                row = {"mesh": f"{name} {n}", "method": label, "data": data, "series": some.tolist(),
-                       "largest": float(np.abs(some).max()), "end": float(some[-1]),
-                       "long": many.tolist(), "long_largest": float(np.abs(many).max()),
+                step = method.prepare(Problem(scene(make(n))), until).step
+                many = np.array(energies(scene(make(n)), method, long * step, 400)) - 1
+                middle = len(many) // 2
+                row = {"mesh": f"{name} {n}", "method": label, "data": data,
+                       "series": some.tolist(), "largest": float(np.abs(some).max()),
+                       "end": float(some[-1]), "long": many.tolist(),
+                       "long_largest": float(np.abs(many).max()),
                        "long_end": float(many[-20:].mean()),
-                       "long_middle": float(many[len(many) // 2 - 10 : len(many) // 2 + 10].mean())}  # fmt: skip
+                       "long_middle": float(many[middle - 10 : middle + 10].mean())}  # fmt: skip
                 rows.append(row)
-                print(f"  {row['mesh']:16} {label:16} {data:8}{row['largest']:9.1e}{row['end']:9.1e}"
+                print(f"  {row['mesh']:16} {label:16} {data:8}{row['largest']:9.1e}"
+                      f"{row['end']:9.1e}"
                       f"{row['long_largest']:12.1e}{row['long_middle']:9.1e}{row['long_end']:9.1e}",
                       flush=True)  # fmt: skip
     return rows
@@ -193,7 +210,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
     axes[0, 0].legend(frameon=False, fontsize=9, title="scheme, α", loc="lower left")
     ax = axes[1, 0]
     for label in COLOURS:
-        if label == "one step":
+        if label not in ("plain", "balanced"):
             continue
         for n, line in ((20, "--"), (80, "-")):
             mine = [r for r in found["time"] if (r["method"], r["per_side"]) == (label, n)]
@@ -209,8 +226,9 @@ def draw(found: dict[str, Any], path: Path) -> None:
         if row["mesh"] == first and row["method"] in ("one step, 0.9", "balanced, 0.45"):
             change = 100 * np.array(row["long"])
             times = np.linspace(0, found["long"], len(change))
-            colour, dash = COLOURS[row["method"].split(",")[0]], ":" if row["data"] == "random" else "-"
-            ax.plot(times, change, dash, lw=1.0, label=f"{row['method']}, {row['data']}", color=colour)
+            colour, dash = COLOURS[row["method"].split(",")[0]], "-:"[row["data"] == "random"]
+            label = f"{row['method']}, {row['data']}"
+            ax.plot(times, change, dash, lw=1.0, label=label, color=colour)
     ax.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(0.0, 0.63))
     ax.set(title=f"Change of energy [%], {first} per side", xlabel="steps, or windows")
     for ax in axes.flat:
