@@ -145,30 +145,6 @@ class Action:
             form = ufl.derivative(form, self.q, ufl.TrialFunction(self.space))
         return form
 
-    def stress_form(self, body: Body, values: bool) -> Any:
-        """∫σ·τ dx with τ constant on cells: the integral of a body's stresses over each cell.
-
-        Components are ∂(ρe)/∂(∂_j q_i) at i·d + j for directions j the mesh has, and, with
-        ``values``, the self-actions ∂(ρe + ρw)/∂q_i behind them.
-        """
-        scene, dim = self.scene, self.scene.mesh.geometry.dim
-        u, nu, U, N = (ufl.variable(field) for field in self.fields(self.q))
-        density = scalar(f"energy of {body.name}", body.energy, U, nu, N)
-        if body.potential is not None:
-            density += scalar(f"potential of {body.name}", body.potential, u, nu)
-        n_u, k = scene.displacement, scene.descriptor
-        P, S = ufl.diff(density, U), ufl.diff(density, N)
-        parts = [P[i, j] for i in range(n_u) for j in range(dim)]
-        parts += [S[i, j] for i in range(k) for j in range(dim)]
-        if values:
-            f, z = ufl.diff(density, u), ufl.diff(density, nu)
-            parts += [f[i] for i in range(n_u)] + [z[i] for i in range(k)]
-        tau = ufl.TestFunction(_compat.cell_space(scene.mesh, (len(parts),)))
-        degree = body.quadrature_degree
-        measure = ufl.dx(domain=scene.mesh)
-        total = sum(part * tau[i] for i, part in enumerate(parts))
-        return total * (measure if degree is None else measure(degree=degree))
-
     def load_form(self, load: Traction | Pressure | BodyForce, facet_tags: Any, tag: int) -> Any:
         """∫t·v ds or ∫b·v dx of a load with factor 1 as a UFL form.
 

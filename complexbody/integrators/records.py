@@ -38,7 +38,7 @@ class World(ctypes.Structure):
             (name, ctypes.c_void_p)
             for name in (
                 "record", "klass", "inverse_mass", "rate", "compliance", "eta", "basis",
-                "inverse_basis", "collected",
+                "collected",
                 "groups", "cell", "geometry", "coefficient", "held", "blend", "sums",
                 "counted", "coordinates", "forms", "touched", "touched_from",
             )
@@ -109,7 +109,7 @@ class RecordRun:
         self._point(
             record=self.record, klass=masses.classes, inverse_mass=self.inverse_mass,
             rate=self.rate, compliance=self.compliance, eta=self.eta, basis=self.basis,
-            inverse_basis=self.inverse_basis, collected=self.collected, cell=disc.cells,
+            collected=self.collected, cell=disc.cells,
             geometry=disc.geometry, coefficient=kernels.coefficients, sums=self.sums,
             counted=self._counted, coordinates=disc.position,
         )  # fmt: skip

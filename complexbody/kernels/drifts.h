@@ -33,7 +33,7 @@ typedef struct {
   const double *rate;         /* [class][NR]: eta / inertia */
   const double *compliance;   /* [class][NR]: 1 / eta where there is no inertia, else 0 */
   const double *eta;          /* [class][NR]: damping per volume */
-  const double *basis, *inverse_basis; /* [class][N][N]: V, in which all these are diagonal */
+  const double *basis;        /* [class][N][N]: V, in which all these are diagonal */
   double *collected;          /* [shared nodes][SENT] */
   const group *groups;
   const int32_t *cell;
