@@ -171,7 +171,7 @@ class _Region:
 
 
 def initial_matrices(problem: Problem, number: int) -> Array:
-    """Stiffness of the cells of a region FFCx takes, at the initial state (cells · W, local, local).
+    """Stiffness of a region's cells by FFCx at the initial state, (cells · W, local, local).
 
     In the basis in which inertia and viscosity are diagonal.
     """

@@ -38,8 +38,8 @@ class AVI:
         safety: α, the fraction of each cell's critical step it may use. Resonances start near
             0.47 of it on bars of two rates, hence 0.45.
         schedule: "octaves" (N_K = ⌈W/h_K⌉ equal steps per window rounded up to a power of two, and
-            until neighbours differ by two at most; the default), "windows" (N_K as it is; the default
-            if not balanced) or "exact" (any real h_K, events at its multiples).
+            until neighbours differ by two at most; the default), "windows" (N_K as it is; the
+            default if not balanced) or "exact" (any real h_K, events at its multiples).
         balanced: Forces act through the cells' steps, which removes the error floor of asynchronous
             stepping; the default on octaves, and only there. False gives an AVI of the paper with
             rational time sets, symplectic, with the floor. An exact schedule is plain.
@@ -132,7 +132,7 @@ class AVI:
 
     @property
     def symplectic(self) -> bool:
-        """Balanced windows are reversible in time, but the forces cells hold are states of their own."""
+        """Balanced windows are reversible, but forces that cells hold are states of their own."""
         return not self.balanced
 
     def prepare(self, problem: Problem, until: float) -> WindowRun | ExactRun:

@@ -2,8 +2,8 @@
 r"""Balanced windows: a cell's force acts through its steps, not at their ends (DESIGN §5).
 
 The forces of neighbouring cells nearly cancel at a node; kicks at different times do not. So cell K
-pulls at its nodes all the time, with a force F that changes at its own times t_j only, such that the
-mean of F before and behind is the force there:
+pulls at its nodes all the time, with a force F that changes at its own times t_j only, such that
+the mean of F before and behind is the force there:
 
 .. math:: F_{j+1/2} + F_{j-1/2} = 2 f_j, \qquad f_j = -\partial V_K(q(t_j)).
 
@@ -11,9 +11,9 @@ F is the force half a step on, to second order, of any smooth motion; impulses o
 those of the kicks it replaces. The rule is the same forwards and backwards in time, and starts from
 F_{1/2} = −∂V_K(q_0 + (h_K/2) q̇_0).
 
-An error ±δ that alternates from step to step neither grows nor decays. Viscosity would make it grow,
-by ω²h²·hη/(12ρ̄) per step for a cell of frequency ω (the mean of the displacement that it causes no
-longer is zero), so that there it must decay, which a kick makes up for:
+An error ±δ that alternates from step to step neither grows nor decays. Viscosity would make it
+grow, by ω²h²·hη/(12ρ̄) per step for a cell of frequency ω (the mean of the displacement that it
+causes no longer is zero), so that there it must decay, which a kick makes up for:
 
 .. math:: F_{j+1/2} = (2-k) f_j - (1-k) F_{j-1/2}, \qquad
    \text{kick}\; h \big(f_j - \tfrac12 (F_{j+1/2} + F_{j-1/2})\big).
@@ -44,7 +44,7 @@ def blending(rates: Array, coupled: Array, step: float) -> Array:
     """k of each component for steps h: min(1, z_i), or what coupling to others needs if larger.
 
     With z = hη/ρ̄ component i feels component j by C_ij² z_j/(1 + z_j²): a descriptor that viscosity
-    holds fast (z ≫ 1) hardly moves, and then nothing comes of it. Where k > 0 a wave without viscosity
+    holds fast (z ≫ 1) hardly moves, and nothing comes of it. Where k > 0 a wave without viscosity
     of its own would grow, by k times a high power of ωh; hence no more than needed.
 
     Args:
@@ -59,7 +59,7 @@ def blending(rates: Array, coupled: Array, step: float) -> Array:
 
 
 def component_rates(problem: Problem, number: int) -> Array:
-    """η/ρ̄ of the components of region ``number`` [1/s]; of several modes the fastest they are in."""
+    """η/ρ̄ of a region's components [1/s]; of several modes the fastest that they are in."""
     body, n_u = problem.scene.bodies[number], problem.scene.displacement
     basis, mass, viscosity = pencil_basis(body.inertia_matrix, body.viscosity_matrix)
     with np.errstate(divide="ignore"):
@@ -71,8 +71,8 @@ def component_rates(problem: Problem, number: int) -> Array:
 def coupling(problem: Problem, number: int) -> Array:
     """C_ij² = |H_ij|²/(|H_ii| |H_jj|) of components i ≠ j of region ``number``, shape (n, n).
 
-    Parts in gradients and in values apart, the largest of them and of up to a thousand cells; if the
-    density is not quadratic, of the cells' stiffness at the initial state.
+    Parts in gradients and in values apart, the largest of them and of up to a thousand cells; if
+    the density is not quadratic, of the cells' stiffness at the initial state.
     """
     n, kernels = problem.disc.n, problem.kernels
     mine = problem.disc.region == number

@@ -58,7 +58,7 @@ class WindowRun(RecordRun):
         self._book_supports(self.time)
 
     def _plain(self) -> None:
-        """Kicks, half of them at the ends; or one-sided: the first ones whole, and none at the end."""
+        """Kicks, half of them at the ends; one-sided: the first ones whole, none at the end."""
         start, end = self.time, (self.steps + 1) * self.step
         whole = self.method.start == "one-sided"
         self._move_supports(start)

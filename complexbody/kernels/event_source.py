@@ -14,7 +14,7 @@ class EventSource(RegionSource):
     """Events of one region: ``event_r`` for cells that act together, ``lone_r`` for others."""
 
     def event(self, balanced: bool) -> str:
-        """Source of ``event_r``: force at the drifted positions, then a kick or a change of force."""
+        """Source of ``event_r``: force at the drifted positions, a kick or a change of force."""
         d, nodes = self.dim, range(self.dim + 1)
         lines = self._gradient_lines("gather_records(s, c + a * W, q[a])")
         between = ["ahead(b, GEOMETRY);"]
@@ -31,7 +31,8 @@ class EventSource(RegionSource):
         return self._loop(
             f"static void event_{self.number}(int64_t blocks, const int32_t *restrict c, "
             "const double *restrict geometry, const double *restrict coefficient, "
-            "double *restrict held, const double *restrict blend, const world *s, double h, int mode)",
+            "double *restrict held, const double *restrict blend, const world *s, double h, "
+            "int mode)",
             [*lines, *forces, *give],
         )
 

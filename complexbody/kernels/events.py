@@ -38,7 +38,8 @@ class Forms:
 
     def __init__(self, kernels: Kernels) -> None:
         bodies = range(len(kernels.action.scene.bodies))
-        self._keep = {r: kernels.tabulated[r][0] for r in bodies if not kernels.densities.generated[r]}
+        generated = kernels.densities.generated
+        self._keep = {r: kernels.tabulated[r][0] for r in bodies if not generated[r]}
         self.records = (TabulatedRecord * len(bodies))()
         for r, force in self._keep.items():
             self.records[r] = force.record

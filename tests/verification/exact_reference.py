@@ -82,7 +82,7 @@ class Exact(Windows):
             self._drift(a, t)
 
     def see(self):
-        """(q, q̇) now: drifted, and impulses completed to this time; the run itself is not touched."""
+        """(q, q̇) now: drifted, impulses completed to this time; the run itself is not touched."""
         kept = [x.copy() for x in (self.q, self.p, self.clock)]
         log, self.log = self.log, None
         for a in range(self.size):

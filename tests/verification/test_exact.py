@@ -9,8 +9,9 @@ import scipy.spatial
 from dense import prepared, state, whole
 from harness import everywhere, refused
 from mpi4py import MPI
+from verification.cases import CASES, Case, build, graded, reference, schemes
 from verification.exact_reference import Exact
-from verification.test_windows import CASES, SIDES, Case, build, graded, pair, reference, schemes
+from verification.waves import SIDES, pair
 
 import complexbody as cb
 from complexbody import _compat, meshes, native
