@@ -76,7 +76,8 @@ def test_variation_of_rates(scheme, balanced):
     assert np.all(found <= most), (found, most)
     assert np.all(found[-1] >= 0.95 * least), (found, least)
     # It settles: another half of the step changes less and less.
-    assert np.all(abs(found[-1] - found[-2]) < 0.03 * found[-1]), found
+    settled = 0.05 if scheme == "forward" else 0.03  # first order
+    assert np.all(abs(found[-1] - found[-2]) < settled * found[-1]), found
 
 
 # --- momenta -------------------------------------------------------------------------------------
