@@ -2,8 +2,7 @@
 r"""Energies, momenta and work against time: the books of a run, and whether they balance.
 
 At a step's own time t_n the balance is
-``kinetic_u + kinetic_nu + stored + potential − work − support_work + dissipated + filtered =
-initial`` (filtered: what an integrator's own filter takes, 0 for synchronous ones);
+``kinetic_u + kinetic_nu + stored + potential − work − support_work + dissipated = initial``;
 for a variational integrator it oscillates with O(h²) and does not drift. To round-off, for linear
 forces, the discrete energy with its effective mass M̂ (DESIGN §2, all three dissipation schemes)
 
@@ -30,7 +29,7 @@ Array = npt.NDArray[np.float64]
 #: Columns and their units; momentum columns follow by component of u.
 COLUMNS = {
     "time": "s", "kinetic_u": "J", "kinetic_nu": "J", "stored": "J", "potential": "J",
-    "work": "J", "support_work": "J", "dissipated": "J", "filtered": "J", "balance": "J",
+    "work": "J", "support_work": "J", "dissipated": "J", "balance": "J",
     "identity": "1",
     "variation_u": "m^(d+1)/s", "variation_nu": "[nu] m^d/s",
 }  # fmt: skip
@@ -90,7 +89,7 @@ class Bookkeeper:
         energy = e.kinetic_u + e.kinetic_nu + e.stored + e.potential
         if self._start is None:
             self._start = energy
-        given = e.work + e.support_work - e.dissipated - e.filtered
+        given = e.work + e.support_work - e.dissipated
         identity = 0.0
         if run.steps > 0 and e.size > 0:
             missing = e.discrete - e.flows
@@ -98,7 +97,7 @@ class Bookkeeper:
             self._size = max(self._size, e.size)
             identity = (missing - self._reference) / self._size
         row = [run.time, e.kinetic_u, e.kinetic_nu, e.stored, e.potential, e.work, e.support_work]
-        row += [e.dissipated, e.filtered, energy - given - self._start, identity]
+        row += [e.dissipated, energy - given - self._start, identity]
         row += [e.variation_u, e.variation_nu, *e.momentum]
         self.ledger.rows.append([float(v) for v in row])
         self._guard(e.surplus - self._start if run.steps > 0 else 0.0)

@@ -28,7 +28,7 @@ class Entries:
     Attributes:
         kinetic_u, kinetic_nu, stored, potential: Energies.
         work, support_work: Work of loads and of moving supports since the start.
-        dissipated: By viscosity; filtered: by an integrator's own filter.
+        dissipated: By viscosity.
         surplus: Energy as it stands between kicks minus all that was given: what a guard watches,
             since rates of a stiff damping make no leaps there.
         discrete, flows: Discrete energy E_h of the last half step, and what must have changed it
@@ -45,7 +45,6 @@ class Entries:
     work: float
     support_work: float
     dissipated: float
-    filtered: float
     surplus: float
     discrete: float
     flows: float

@@ -93,7 +93,7 @@ class RecordRun:
         self.halo = disc.halo.widened(sent) if sent > disc.record else disc.halo
         self.sums = kernels.sums
         self.sums[:] = 0.0
-        self.work, self.support_work, self.filtered = 0.0, 0.0, 0.0
+        self.work, self.support_work = 0.0, 0.0
         self._loaded = problem.comm.allreduce(len(problem.load_value)) > 0
         self.mass = np.ascontiguousarray(masses.full(masses.inertia, masses.density))
         kernels.state.klass = masses.classes.ctypes.data
@@ -290,10 +290,10 @@ class RecordRun:
         common = energies(self.problem, self.mass, rates)
         works: dict[str, Any] = {
             "work": self.work, "support_work": self.support_work,
-            "dissipated": self.dissipated(), "filtered": self.filtered,
+            "dissipated": self.dissipated(),
         }  # fmt: skip
         kinetic = common["kinetic_u"] + common["kinetic_nu"]
-        given = self.work + self.support_work - works["dissipated"] - self.filtered
+        given = self.work + self.support_work - works["dissipated"]
         return Entries(
             **common, **works,
             surplus=kinetic + common["stored"] + common["potential"] - given,

@@ -29,7 +29,7 @@ def entries(run: SynchronousRun) -> Entries:
     common = energies(problem, run.mass, rates)
     flows = float(kernels.sums[3] + kernels.sums[4] - kernels.sums[0])
     return Entries(
-        **common, work=work, support_work=support, dissipated=lost, filtered=0.0,
+        **common, work=work, support_work=support, dissipated=lost,
         surplus=drift + common["stored"] + common["potential"] - flows,
         discrete=discrete, flows=flows if size else 0.0, size=size,
         variation_u=float(kernels.sums[1]), variation_nu=float(kernels.sums[2]),
