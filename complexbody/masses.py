@@ -163,7 +163,7 @@ class Masses:
 
     @property
     def one_rate(self) -> bool:
-        """True if all components of ν of a class have inertia and the same rate η/ρ̄.
+        """True if all components of a class that have a rate η/ρ̄ > 0 have the same, and inertia.
 
         Prescribed components have the rate 0: they move as they are told.
         """
@@ -171,7 +171,8 @@ class Masses:
         if np.any(m == 0):
             return False
         rate = np.where(self.fixed[:, self.n_u :], 0.0, d / m)
-        return bool(np.all(np.ptp(rate, axis=1) <= 1e-14 * np.abs(rate).max(axis=1)))
+        most = rate.max(axis=1, keepdims=True)
+        return bool(np.all((rate == 0) | (np.abs(rate - most) <= 1e-14 * most)))
 
     def diagonalised(self) -> Diagonal:
         """Per class a basis of the free components in which inertia and viscosity are diagonal."""

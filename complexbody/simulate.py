@@ -160,12 +160,12 @@ class Simulation:
         self.problem = Problem(scene)
         self.run_: Run = method.prepare(self.problem, until)
         self.last = int(np.ceil(until / self.run_.step - 1e-9))
+        self.times = output.schedule(until) if output is not None else np.zeros(0)
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
         self.writer = Writer(self.problem.action, output) if output is not None else None
         if self.writer is not None:
             self.writer.write_steps(self._steps())
         self.books = Bookkeeper(self.problem, self.run_, growth)
-        self.times = output.schedule(until) if output is not None else np.zeros(0)
         start = self.problem.initial_fields, self.problem.initial_rates
         self.functions = self.problem.functions(*start)
         self.receivers: Receivers | None = None

@@ -37,7 +37,8 @@ class World(ctypes.Structure):
         *(
             (name, ctypes.c_void_p)
             for name in (
-                "record", "klass", "inverse_mass", "rate", "compliance", "eta", "basis",
+                "record", "klass", "inverse_mass", "rate", "pace", "paced", "compliance", "eta",
+                "basis",
                 "collected",
                 "groups", "cell", "geometry", "coefficient", "held", "blend", "sums",
                 "counted", "coordinates", "forms", "touched", "touched_from",
@@ -89,6 +90,9 @@ class RecordRun:
         self.collected = native.aligned((max(disc.shared, 1), sent))
         self._force = native.aligned((disc.nodes + 1, disc.record))
         self._rates = native.aligned((disc.nodes + 1, disc.record))
+        self._pace = np.ascontiguousarray(self.rate.max(axis=1))
+        self._paced = native.aligned(self.rate.shape)
+        self._paced[:] = self.rate > 0
         self._counted = np.append(disc.owned, False)  # padding cells' node counts for nothing
         self.halo = disc.halo.widened(sent) if sent > disc.record else disc.halo
         self.sums = kernels.sums
@@ -108,8 +112,8 @@ class RecordRun:
         world.nodes, world.late, world.beyond = disc.nodes, disc.late, disc.late + disc.shared
         self._point(
             record=self.record, klass=masses.classes, inverse_mass=self.inverse_mass,
-            rate=self.rate, compliance=self.compliance, eta=self.eta, basis=self.basis,
-            collected=self.collected, cell=disc.cells,
+            rate=self.rate, pace=self._pace, paced=self._paced, compliance=self.compliance,
+            eta=self.eta, basis=self.basis, collected=self.collected, cell=disc.cells,
             geometry=disc.geometry, coefficient=kernels.coefficients, sums=self.sums,
             counted=self._counted, coordinates=disc.position,
         )  # fmt: skip

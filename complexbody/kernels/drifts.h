@@ -31,6 +31,7 @@ typedef struct {
   const int32_t *klass;       /* class of a node, or NULL */
   const double *inverse_mass; /* [class][NR]: 0 where prescribed; 1 where there is no inertia */
   const double *rate;         /* [class][NR]: eta / inertia */
+  const double *pace, *paced; /* unless SLOW: [class] the one rate of a class, [class][NR] 1 where it holds */
   const double *compliance;   /* [class][NR]: 1 / eta where there is no inertia, else 0 */
   const double *eta;          /* [class][NR]: damping per volume */
   const double *basis;        /* [class][N][N]: V, in which all these are diagonal */
@@ -184,7 +185,7 @@ INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
   for (int l = 0; l < W; l++) {
     const double *r = record_of(s, nodes[l]);
     dt[l] = t[l] - r[TIME];
-    z[l] = s->rate[(s->klass ? s->klass[nodes[l]] : 0) * NR + NU];
+    z[l] = s->pace[s->klass ? s->klass[nodes[l]] : 0];
     volume[l] = s->counted[nodes[l]] ? r[INVERSE] : INFINITY;
   }
   const drifting d = coefficients(dt, z * dt);
@@ -192,14 +193,14 @@ INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
   memcpy(c, &d, sizeof c);
   volume = dt / volume;
   memcpy(weight, &volume, sizeof weight);
-  nvec nu[NR / VN], lost[NR / VN];
-  for (int i = 0; i < NR; i++) nu[i / VN][i % VN] = i >= NU && i < N;
+  nvec lost[NR / VN];
   memset(lost, 0, sizeof lost);
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);
     if (r[TIME] == t[l]) continue; /* at rest in time, or a node that comes again */
     nvec *x = (nvec *)r, *v = (nvec *)(r + NR);
-    const nvec *eta = (const nvec *)(s->eta + (s->klass ? s->klass[nodes[l]] : 0) * NR);
+    const int64_t row = (s->klass ? s->klass[nodes[l]] : 0) * NR;
+    const nvec *eta = (const nvec *)(s->eta + row), *nu = (const nvec *)(s->paced + row);
     for (int g = 0; g < NR / VN; g++) {
 #if BALANCED
       const nvec a = ((nvec *)(r + 2 * NR))[g];
