@@ -235,7 +235,7 @@ def measure(dim: int, cells: int, grade: float, viscosity: float, repeats: int) 
     rows, sets = {"synchronous": sync}, None
     for name, method in METHODS.items():
         rows[name], run = asynchronous(method, problem)
-        sets = getattr(run, "time_sets", sets)  # windows have them
+        sets = sets or run.time_sets  # those of windows: spans of real steps are short
     if viscosity == 0:
         heap = Heap(one.problem, AVI().safety)
         call = lambda: heap.events(10**6)  # noqa: E731

@@ -50,8 +50,9 @@ class Schedule(ctypes.Structure):
         ("cells", ctypes.c_int64), ("visits", ctypes.c_int64),
         *(
             (name, ctypes.c_void_p)
-            for name in ("packed", "node", "region", "step", "counter", "actor", "index", "row",
-                         "row_node", "list", "event", "link", "last", "stack", "bucket")
+            for name in ("packed", "node", "region", "step", "counter", "due", "actor", "index",
+                         "row", "row_node", "list", "event", "link", "last", "stack",
+                         "bucket")
         ),
         ("buckets", ctypes.c_int64),
         *(
@@ -119,6 +120,7 @@ class ExactSchedule:
         self.arrays: dict[str, Array | Ints | npt.NDArray[Any]] = {
             "packed": self._pack(problem, steps), "step": every,
             "node": np.ascontiguousarray(disc.cells.transpose(0, 2, 1)), "counter": self.counter,
+            "due": np.where(np.isfinite(every), 0.0, np.inf),
             "region": np.repeat(disc.region, disc.lanes).astype(np.int32),
             "actor": order.astype(np.int32), "index": self._index.astype(np.int32),
             "row": visits["row"].astype(np.int32),

@@ -13,7 +13,7 @@
 #define SLOTS (DIM + 1)
 #define STEP (GEOMETRY + COEFFICIENTS) /* in a packed cell: geometry, coefficients, h_K, nodes */
 
-typedef struct { double time; int64_t index; } entry; /* before it is known who waits for whom */
+typedef struct { double time; int32_t index, actor; } entry; /* not yet known who waits for whom */
 typedef struct {
   double time;
   int32_t actor, waits;    /* cell, or cells + visit; for so many others, and for a kick to come in */
@@ -27,6 +27,7 @@ typedef struct {
   const int32_t *region;    /* [cell] */
   const double *step;       /* of cells and visits by rank and global number: [index] */
   int64_t *counter;         /* [index]: the next event's j */
+  double *due;              /* [index]: its time, infinite for padding */
   const int32_t *actor;     /* [index]: cell, or cells + visit */
   const int32_t *index;     /* [cell] */
   const int32_t *row;       /* [visit]: row of the receive table, node and neighbour */
@@ -67,6 +68,7 @@ static void in_order(schedule *x, double t0, double t1) {
 #define BUCKET(t) ({ int64_t b_ = (int64_t)(((t) - t0) * scale);                                    \
                      b_ < 0 ? 0 : b_ >= x->buckets ? x->buckets - 1 : b_; })
   for (int64_t i = 0; i < all; i++) {
+    if (x->due[i] >= t1) continue;
     const double h = x->step[i];
     for (int64_t j = x->counter[i]; j * h < t1; j++) x->bucket[BUCKET(j * h) + 1]++;
   }
@@ -77,10 +79,13 @@ static void in_order(schedule *x, double t0, double t1) {
   }
   x->events = x->bucket[x->buckets];
   for (int64_t i = 0; i < all; i++) {
+    if (x->due[i] >= t1) continue;
     const double h = x->step[i];
     int64_t j = x->counter[i];
-    for (; j * h < t1; j++) x->list[x->bucket[BUCKET(j * h)]++] = (entry){j * h, i};
+    for (; j * h < t1; j++)
+      x->list[x->bucket[BUCKET(j * h)]++] = (entry){j * h, (int32_t)i, x->actor[i]};
     x->counter[i] = j;
+    x->due[i] = j * h;
   }
   for (int64_t b = 0, first = 0; crowded && b < x->buckets; first = x->bucket[b++]) {
     entry *e = x->list + first;
@@ -115,9 +120,9 @@ int64_t cb_exact_schedule(const world *s, schedule *x, double t0, double t1, int
   for (int64_t r = 0; r < rows; r++) x->head[r] = x->tail[r] = -1;
   x->top = x->done = 0;
   for (int32_t e = 0; e < x->events; e++) {
-    const int32_t w = x->actor[x->list[e].index];
+    const int32_t w = x->list[e].actor;
     if (e + 2 * AHEAD < x->events) {
-      const int32_t far = x->actor[x->list[e + 2 * AHEAD].index], v = x->actor[x->list[e + AHEAD].index];
+      const int32_t far = x->list[e + 2 * AHEAD].actor, v = x->list[e + AHEAD].actor;
       if (far < x->cells) __builtin_prefetch(x->node + (int64_t)far * SLOTS);
       if (v < x->cells)
         for (int a = 0; a <= DIM; a++) __builtin_prefetch(x->last + x->node[(int64_t)v * SLOTS + a], 1);
@@ -233,7 +238,6 @@ static void take(schedule *x, lot *l) {
     if (l->count && x->region[w] != REGION(l->which[0])) break;
     l->which[l->count++] = e;
     x->top--;
-    __builtin_prefetch(x->node + (int64_t)w * SLOTS);
     for (int i = 0; i < PACKED; i += 8) __builtin_prefetch(x->packed + (int64_t)w * PACKED + i);
     for (int a = 0; a <= DIM; a++) __builtin_prefetch(x->event + x->event[e].next[a], 1);
   }
@@ -242,7 +246,8 @@ static void take(schedule *x, lot *l) {
 /* Their nodes' records are sent for. */
 static void fetch(const world *s, const schedule *x, const lot *l) {
   for (int i = 0; i < l->count; i++) {
-    const int32_t *c = x->node + (int64_t)x->event[l->which[i]].actor * SLOTS;
+    const double *row = x->packed + (int64_t)x->event[l->which[i]].actor * PACKED;
+    const int32_t *c = (const int32_t *)(row + STEP + 1);
     for (int a = 0; a <= DIM; a++)
       for (int j = 0; j < RECORD; j += 8) __builtin_prefetch(record_of(s, c[a]) + j, 1);
   }
