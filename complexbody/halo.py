@@ -67,6 +67,7 @@ class Halo:
         shared: As from :func:`sharing`, but keyed by *position* among the shared nodes.
         order: Global number of each shared node: neighbours list their nodes in its order.
         width: Doubles per node.
+        apart: On a communicator of its own.
 
     Attributes:
         sends: Positions of shared nodes in the order in which they are packed.
@@ -76,8 +77,10 @@ class Halo:
         owner: True where this rank is the lowest that touches the node (it counts it in sums).
     """
 
-    def __init__(self, comm: Any, shared: dict[int, list[int]], order: Ints, width: int) -> None:
-        self._own = comm.size > 1
+    def __init__(
+        self, comm: Any, shared: dict[int, list[int]], order: Ints, width: int, apart: bool = True
+    ) -> None:
+        self._own = apart and comm.size > 1
         self.comm = comm.Dup() if self._own else comm
         self._made_from = (shared, order)
         me, count = comm.rank, len(shared)
@@ -115,6 +118,15 @@ class Halo:
     def widened(self, width: int) -> Halo:
         """Another exchange over the same nodes with more doubles each; collective."""
         return Halo(self.comm, *self._made_from, width)
+
+    def part(self, rows: npt.NDArray[np.int32]) -> Halo:
+        """An exchange of some of the shared nodes only, by position: the same nodes on all ranks.
+
+        It goes over this one's communicator, and is to be closed before it.
+        """
+        shared, order = self._made_from
+        some = {i: shared[int(p)] for i, p in enumerate(rows)}
+        return Halo(self.comm, some, order[rows], self.outgoing.shape[1], apart=False)
 
     def begin(self) -> None:
         """Start sending ``outgoing`` and receiving into ``incoming``."""

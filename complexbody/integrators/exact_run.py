@@ -96,17 +96,11 @@ class ExactRun(RecordRun):
         self.c.cb_drift(seen, ctypes.c_int64(0), nodes, t)
         self.c.cb_exact_complete(seen, self._ahead, ctypes.c_int64(disc.blocks), t)
         if self.problem.comm.size > 1:
-            self._begin()
-            self._finish(seen, t)
+            message = self._message(self._rows)
+            message.begin()
+            message.end(self.time, seen)
         self._sampled = (self.steps, float(self.sums[0]))
         self.sums[0] = before
-
-    def _finish(self, seen: object, t: ctypes.c_double) -> None:
-        """Add all ranks' completing kicks of shared nodes to the copy."""
-        halo, disc = self.halo, self.problem.disc
-        halo.end()
-        halo.add(self.collected[: disc.shared])
-        self.c.cb_apply(seen, t, native.pointer(self._rows), ctypes.c_int64(len(self._rows)))
 
     def sample(self) -> tuple[Array, Array]:
         """(u, ν) and rates at the last span's end, node records (nodes + 1, NR)."""

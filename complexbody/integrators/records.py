@@ -17,6 +17,7 @@ from mpi4py import MPI
 
 from complexbody import native
 from complexbody.integrators.entries import Entries, energies
+from complexbody.integrators.messages import Message
 from complexbody.integrators.timetable import TimeSets
 from complexbody.kernels import events
 from complexbody.problem import Problem
@@ -121,6 +122,7 @@ class RecordRun:
             world.klass = 0
         world.forms = ctypes.addressof(self._forms.records)
         self._world = ctypes.byref(world)
+        self._messages: dict[bytes, Message] = {}
 
     def _point(self, **arrays: npt.NDArray[Any]) -> None:
         """Hand arrays, which the run keeps, to the C side."""
@@ -164,7 +166,10 @@ class RecordRun:
         return self.steps * self.step
 
     def close(self) -> None:
-        """Free the run's own communicator; collective."""
+        """Free the run's own communicator and messages; collective."""
+        for message in self._messages.values():
+            message.halo.close()
+        self._messages = {}
         if self.halo is not self.problem.disc.halo:
             self.halo.close()
 
@@ -245,20 +250,12 @@ class RecordRun:
             self.halo.sum(block)
             values[disc.late : disc.late + disc.shared] = block
 
-    def _begin(self) -> None:
-        """Send the kicks that this rank's cells gave to shared nodes."""
-        halo = self.halo
-        halo.outgoing[:, : self.collected.shape[1]] = self.collected[halo.sends]
-        halo.begin()
-
-    def _end(self, t: float, rows: npt.NDArray[np.int32]) -> None:
-        """Apply all ranks' kicks at t to those shared nodes (by position) that cells acted on."""
-        halo, disc = self.halo, self.problem.disc
-        halo.end()
-        halo.add(self.collected[: disc.shared])
-        self.c.cb_apply(
-            self._world, ctypes.c_double(t), native.pointer(rows), ctypes.c_int64(len(rows))
-        )
+    def _message(self, rows: npt.NDArray[np.int32]) -> Message:
+        """The exchange of those shared nodes (by position); made when first asked for."""
+        key = rows.tobytes()
+        if key not in self._messages:
+            self._messages[key] = Message(self.halo.part(rows), rows, self._world, self.c)
+        return self._messages[key]
 
     # --- what a user sees at a beat's end ------------------------------------------------------
 

@@ -99,10 +99,11 @@ class WindowRun(RecordRun):
             replay(0, plan.total)
         else:
             for cut in plan.cuts:
+                message = self._message(cut.touched)
                 replay(cut.first, cut.shared)
-                self._begin()
+                message.begin()
                 replay(cut.shared, cut.last)
-                self._end(start + cut.time, cut.touched)
+                message.end(start + cut.time)
             replay(plan.cuts[-1].last if plan.cuts else 0, plan.total)
         nodes = ctypes.c_int64(self.problem.disc.nodes)
         c.cb_drift(self._world, ctypes.c_int64(0), nodes, ctypes.c_double(end))
@@ -129,5 +130,6 @@ class WindowRun(RecordRun):
     def _exchange(self, t: float) -> None:
         """What cells of all ranks gave to shared nodes at t."""
         if self.problem.comm.size > 1:
-            self._begin()
-            self._end(t, self.plan.every_shared)
+            message = self._message(self.plan.every_shared)
+            message.begin()
+            message.end(t)

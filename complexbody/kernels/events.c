@@ -37,6 +37,26 @@ void cb_drift(const world *s, int64_t first, int64_t last, double t) {
   }
 }
 
+/* What the cells of this rank gave to shared nodes (by position), into a message. */
+void cb_pack_shared(const world *s, int64_t count, const int32_t *position, double *message) {
+  for (int64_t i = 0; i < count; i++)
+    memcpy(message + i * SENT, s->collected + (int64_t)position[i] * SENT, SENT * sizeof(double));
+}
+
+/* The sum of all ranks' parts, in the order of the ranks; source -1 is this rank's own. */
+void cb_add_shared(const world *s, int64_t count, const int32_t *position, const int64_t *start,
+                   const int64_t *source, const double *received) {
+  for (int64_t i = 0; i < count; i++) {
+    double *own = s->collected + (int64_t)position[i] * SENT, sum[SENT];
+    memset(sum, 0, sizeof sum);
+    for (int64_t j = start[i]; j < start[i + 1]; j++) {
+      const double *part = source[j] < 0 ? own : received + source[j] * SENT;
+      for (int c = 0; c < SENT; c++) sum[c] += part[c];
+    }
+    memcpy(own, sum, sizeof sum);
+  }
+}
+
 /* Kicks of shared nodes, collected and summed over ranks, at time t, for the `count` nodes whose cells
  * acted on some rank: they drift even if no force comes of it. Empties the collection. */
 void cb_apply(const world *s, double t, const int32_t *rows, int64_t count) {
