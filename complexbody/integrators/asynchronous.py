@@ -46,9 +46,10 @@ class AVI:
         dissipation: "exact", "symmetric" or "forward", as for Synchronous.
         start: "trapezoidal" (a cell's first kick is a half, order 2) or "one-sided" (the paper's,
             order 1; not balanced).
-        corrected: Give each cell the softer potential V_K − (h_K²/24) ∇V_K·M⁻¹∇V_K, which cures
-            most of what a cell that acts alone sees of its own ripple; "exact" only, where it is
-            the default. Still a potential per cell: symplectic, momentum kept.
+        corrected: Give each cell the softer potential V_K − θ_K (h_K²/24) ∇V_K·M⁻¹∇V_K, which
+            cures most of what a cell that acts alone sees of its own ripple, θ_K being the share
+            of its neighbours with other steps than its own; "exact" only, where it is the default.
+            Still a potential per cell: symplectic, momentum kept.
         steps: h_K of this rank's cells [s], in the order of dolfinx's owned cells; "exact" only.
         unstable_ok: Run even with ``steps`` above the cells' critical ones.
 

@@ -118,7 +118,7 @@ class ExactSchedule:
         self._starts = np.concatenate([[0], np.cumsum(kicks)])
         by_node = np.argsort(self.halo.sends, kind="stable")
         self.arrays: dict[str, Array | Ints | npt.NDArray[Any]] = {
-            "packed": self._pack(problem, steps), "step": every,
+            "packed": self._pack(problem, steps, self._alone(disc, steps, visits)), "step": every,
             "node": np.ascontiguousarray(disc.cells.transpose(0, 2, 1)), "counter": self.counter,
             "due": np.where(np.isfinite(every), 0.0, np.inf),
             "region": np.repeat(disc.region, disc.lanes).astype(np.int32),
@@ -196,8 +196,30 @@ class ExactSchedule:
             np.add.at(out, first + place, most)
         return out
 
-    def _pack(self, problem: Problem, steps: Array) -> Array:
-        """Cells one after the other: geometry, coefficients, h_K, nodes (cells, PACKED)."""
+    def _alone(self, disc: Any, steps: Array, visits: dict[str, Any]) -> Array:
+        """Share of a cell's neighbours that do not act together with it (blocks, W).
+
+        Counted node by node, neighbours at two nodes twice; those of equal steps act together.
+        """
+        real = disc.source_cell >= 0
+        mine = disc.cells.transpose(0, 2, 1)[real]
+        h = np.broadcast_to(steps[real][:, None], mine.shape)
+        node = np.concatenate([mine.ravel(), disc.late + self.halo.sends[visits["row"]]])
+        every = np.concatenate([h.ravel(), visits["step"]])
+        order = np.lexsort((every, node))
+        node, every = node[order], every[order]
+        new = (np.diff(node) != 0) | (np.diff(every) > 1e-9 * every[1:])
+        run = np.concatenate([[0], np.cumsum(new)]).astype(np.int64)
+        together = np.empty(len(order))
+        together[order] = np.bincount(run)[run] - 1.0
+        there = np.bincount(node, minlength=disc.nodes)[mine] - 1.0
+        equal = together[: mine.size].reshape(mine.shape).sum(axis=1)
+        out = np.zeros(real.shape)
+        out[real] = 1.0 - equal / np.maximum(there.sum(axis=1), 1.0)
+        return out
+
+    def _pack(self, problem: Problem, steps: Array, alone: Array) -> Array:
+        """Cells one after the other: geometry, coefficients, h_K, nodes, alone (cells, PACKED)."""
         disc, kernels = problem.disc, problem.kernels
         size, count = packed_size(kernels), len(kernels.densities.coefficients)
         out = native.aligned((disc.blocks, disc.lanes, size))
@@ -208,6 +230,7 @@ class ExactSchedule:
         out[:, :, used + count] = np.where(np.isfinite(steps), steps, 0.0)
         nodes = out.view(np.int32)[:, :, 2 * (used + count + 1) :]
         nodes[:, :, : disc.dim + 1] = disc.cells.transpose(0, 2, 1)
+        nodes.view(np.float32)[:, :, disc.dim + 1] = alone
         return out
 
     # --- a span ------------------------------------------------------------------------------

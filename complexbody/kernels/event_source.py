@@ -40,7 +40,7 @@ class EventSource(RegionSource):
         """Source of ``lone_r``: W cells that share no node, each drifted to its own t, and forces.
 
         Args:
-            corrected: Take the force at q + (h²/12) M⁻¹f(q), M the nodes' masses, ``soft`` = h²/12:
+            corrected: Take the force at q + (θh²/12) M⁻¹f(q), M the nodes' masses, soft = θh²/12:
                 to leading order that of the softer potential V_K − (h²/24) ∇V_K·M⁻¹∇V_K.
         """
         first, *gradients = self._gradient_lines("drift_gather(s, c + a * W, t, q[a])")

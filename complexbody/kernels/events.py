@@ -102,7 +102,7 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
 
 
 def packed_size(kernels: Kernels) -> int:
-    """Doubles per cell of an exact schedule: geometry, coefficients, step, nodes; whole vectors."""
+    """Doubles per cell of an exact schedule: geometry, coefficients, step, nodes, alone."""
     disc = kernels.disc
-    used = disc.dim**2 + 1 + len(kernels.densities.coefficients) + 1 + -(-(disc.dim + 1) // 2)
+    used = disc.dim**2 + 1 + len(kernels.densities.coefficients) + 1 + -(-(disc.dim + 2) // 2)
     return -(-used // disc.lanes) * disc.lanes

@@ -11,7 +11,7 @@
 #include <stdlib.h>
 
 #define SLOTS (DIM + 1)
-#define STEP (GEOMETRY + COEFFICIENTS) /* in a packed cell: geometry, coefficients, h_K, nodes */
+#define STEP (GEOMETRY + COEFFICIENTS) /* a packed cell: geometry, coefficients, h_K, nodes, alone */
 
 typedef struct { double time; int32_t index, actor; } entry; /* not yet known who waits for whom */
 typedef struct {
@@ -196,7 +196,7 @@ static void emit(const schedule *x, const int32_t *c, const vec weight, const ve
 
 /* `count` events of one region that share no node act. */
 static void act_alone(const world *s, schedule *x, const int32_t *which, int count) {
-  vec b[PACKED], out[DIM + 1][NR], t, weight;
+  vec b[PACKED], out[DIM + 1][NR], t, weight, alone;
   int32_t c[SLOTS * W], cell[W];
   const double *row[W];
   for (int l = 0; l < W; l++) {
@@ -206,6 +206,7 @@ static void act_alone(const world *s, schedule *x, const int32_t *which, int cou
     t[l] = e->time;
     const int32_t *node = (const int32_t *)(row[l] + STEP + 1);
     for (int a = 0; a <= DIM; a++) c[a * W + l] = l < count ? node[a] : (int32_t)s->nodes;
+    alone[l] = *(const float *)(node + SLOTS);
   }
   for (int g = 0; g < PACKED; g += W) {
     vec r[W];
@@ -219,7 +220,7 @@ static void act_alone(const world *s, schedule *x, const int32_t *which, int cou
     if (x->trapezoidal && t[l] == 0) weight[l] *= 0.5;
     if (l >= count) weight[l] = 0;
   }
-  LONE(x->region[cell[0]], s, c, cell, b, b + GEOMETRY, t, h * h / 12.0, count, out);
+  LONE(x->region[cell[0]], s, c, cell, b, b + GEOMETRY, t, alone * h * h / 12.0, count, out);
   for (int a = 0; a <= DIM; a++) kick(s, c + a * W, weight, out[a]);
   if (x->last_shared > x->first_shared)
     for (int a = 0; a <= DIM; a++) emit(x, c + a * W, weight, out[a], count);

@@ -98,7 +98,9 @@ def build(comm, case, mesh=None):
     for r, (inertia, viscosity) in enumerate(zip(case.inertia, case.viscosity, strict=True)):
         H, C, l = parts(case, r)  # noqa: E741
 
-        def energy(U, nu, N, r=r, base=quadratic(H, case.dim)):
+        base = quadratic(H, case.dim)
+
+        def energy(U, nu, N, r=r, base=base):
             value = base(U, nu, N)
             if case.quartic[r]:
                 b, c, s = QUARTIC

@@ -18,7 +18,7 @@ class Exact(Windows):
     Args:
         steps: h_K of every cell.
         start: "trapezoidal": first kicks are halves, "one-sided": whole.
-        corrected: Forces at q + (h²/12) M⁻¹f(q).
+        corrected: Forces at q + (θh²/12) M⁻¹f(q), θ the share of neighbours with other steps.
         acted: Nodes (mask) that loads or supports act on at the ends of beats of length ``window``.
         The rest as for :class:`Windows`.
     """
@@ -29,6 +29,12 @@ class Exact(Windows):
         self.trapezoidal = start == "trapezoidal"
         self.heap = [(0.0, K, 0) for K in range(len(steps))]
         self.done = np.zeros(len(steps), int)
+        self.alone = np.zeros(len(steps))
+        for K, cell in enumerate(self.cells):
+            around = [np.flatnonzero((self.cells == a).any(axis=1)) for a in cell]
+            others = [j for found in around for j in found if j != K]
+            apart = [abs(steps[j] - steps[K]) > 1e-9 * steps[K] for j in others]
+            self.alone[K] = np.float32(np.mean(apart)) if others else 1.0
         self.clock = np.zeros(self.size)
 
     def _drift(self, a, t):
@@ -53,7 +59,8 @@ class Exact(Windows):
         soft = q.copy()
         for i, a in enumerate(nodes):
             ix = self.free[a]
-            soft[i, ix] += self.steps[K] ** 2 / 12 * self.nodes[a].rate(force[i, ix])
+            amount = self.alone[K] * self.steps[K] ** 2 / 12
+            soft[i, ix] += amount * self.nodes[a].rate(force[i, ix])
         return self.potentials[K].force(soft)
 
     def _do_window(self):

@@ -157,6 +157,19 @@ def test_coinciding_events(comm):
     compare(run, heap_of(run, case, steps), 3)
 
 
+def test_cells_together_need_no_correction(comm):
+    """Neighbours of equal steps cancel each other: there nothing is corrected."""
+    case, states = CASES["n4"], []
+    for corrected in (False, True):
+        scene = build(comm, case)
+        steps = np.full(_compat.cell_count(scene.mesh)[0], 0.4 * critical_step(Problem(scene)))
+        run = prepared(scene, AVI(schedule="exact", corrected=corrected, steps=steps), 1.0)
+        run.advance(4)
+        states.append(state(run))
+    for one, other in zip(*states, strict=True):
+        assert abs(one - other).max() < 1e-14 * abs(one).max()
+
+
 @pytest.mark.parametrize("corrected", [False, True], ids=["plain", "corrected"])
 def test_momentum(comm, corrected):
     """A free body keeps its linear momentum, also where its density varies."""
