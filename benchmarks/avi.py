@@ -35,7 +35,8 @@ from complexbody.timesets import cell_steps
 METHODS: dict[str, Any] = {
     "plain windows": AVI(balanced=False),
     "balanced windows": AVI(),
-    "exact": AVI(schedule="exact", balanced=False),
+    "real steps": AVI(schedule="exact", corrected=False),
+    "real, corrected": AVI(schedule="exact"),
 }
 #: Parts of a balanced window whose share is told.
 PARTS = {"load": "loads"}

@@ -293,7 +293,8 @@ def check(a: argparse.Namespace, ranks: Any) -> None:
         problem.close()
     say(ranks, report.memory(problem.kernels.bytes_per_cell(), cells))
     say(ranks, *told)
-    rate = (cells if sets is None else sets.updates) / per_step / comm.size
+    updates = cells if sets is None else sets.updates * prepared.step / sets.window
+    rate = updates / per_step / comm.size
     say(ranks, report.entry("rate", f"{rate / 1e6:.3g} million cell updates per second and core"))
     if job.until is None:
         say(ranks, report.entry("time", "give --until T for an estimate"))

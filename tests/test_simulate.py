@@ -274,13 +274,16 @@ def test_scene_is_as_it_was(comm):
 # --- local steps ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("method", [cb.AVI(), cb.AVI(balanced=False), cb.LocalLeapfrog()])
+LOCAL = [cb.AVI(), cb.AVI(balanced=False), cb.AVI(schedule="exact"), cb.LocalLeapfrog()]
+
+
+@pytest.mark.parametrize("method", LOCAL)
 def test_local_steps(comm, shared_path, method, monkeypatch):
     """Integrators with local steps give results like the others, and free their communicators."""
     halos, made = [], Halo.__init__
 
-    def noted(self, *given):
-        made(self, *given)
+    def noted(self, *given, **options):
+        made(self, *given, **options)
         halos.append(self)
 
     monkeypatch.setattr(Halo, "__init__", noted)

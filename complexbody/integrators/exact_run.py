@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from complexbody import native
 from complexbody.integrators.exact_schedule import ExactSchedule
@@ -40,7 +41,9 @@ class ExactRun(RecordRun):
         trapezoidal = method.start == "trapezoidal"
         self.schedule = ExactSchedule(problem, steps, span, trapezoidal)
         own = per_cell(disc, steps)
-        self.time_sets = time_sets(disc, own, critical, span)
+        # Counted over the largest step: spans are as short as suits the machine.
+        largest = problem.comm.allreduce(float(own.max(initial=0.0)), op=MPI.MAX)
+        self.time_sets = time_sets(disc, own, critical, largest)
         self._ahead = ctypes.byref(self.schedule.state)
         # Kicks of shared nodes are applied one by one, not collected.
         self.world.late = self.world.beyond = 0
