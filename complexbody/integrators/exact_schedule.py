@@ -23,9 +23,9 @@ Ints = npt.NDArray[np.int64]
 _TAG = 8
 
 
-#: A span has about so many events, or a quarter of an event per cell: its arrays stay in a cache,
+#: A span has about so many events, or one per cell if that is more: its arrays stay in a cache,
 #: and little is lost in going through all cells for it.
-EVENTS, PER_CELL = 50_000, 0.25
+EVENTS, PER_CELL = 50_000, 1.0
 
 
 def span_length(steps: Array, until: float, comm: Any) -> float:
