@@ -65,10 +65,11 @@ def compare(run, heap, spans, tolerance=1e-11):
         assert np.isfinite(scales).all() and worst.max() < tolerance, (worst, heap.count)
 
 
+SOME = ("n3", "n4 blocks", "n6 regions", "quartic region")  # also on several ranks
 ALL = [(n, s, True, "trapezoidal") for n, c in CASES.items() for s in schemes(c)]
 ALL += [(n, s, False, "one-sided") for n in CASES for s in schemes(CASES[n])[-1:]]
-SOME = ("n3", "n4 blocks", "n6 regions", "quartic region")
 ALL += [(n, "exact", *mixed) for n in SOME for mixed in ((True, STARTS[1]), (False, STARTS[0]))]
+ALL = [pytest.param(*c, marks=() if c[0] in SOME else pytest.mark.serial) for c in ALL]
 
 
 @pytest.mark.parametrize("name, scheme, corrected, start", ALL)

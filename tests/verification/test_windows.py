@@ -45,6 +45,7 @@ def test_trajectories(comm, name, scheme, balanced):
     compare(run, plain, 5)
 
 
+@pytest.mark.serial
 @pytest.mark.parametrize("name, scheme", [(n, schemes(CASES[n])[-1]) for n in CASES])
 def test_one_sided(comm, name, scheme):
     """The paper's start on windows: whole kicks at their starts, none at their ends."""
