@@ -33,8 +33,16 @@ from complexbody.problem import Problem
 from complexbody.timesets import cell_steps, critical_step
 
 
+SOME = ("n3", "n4 blocks", "n4 half of it", "n6 regions", "quartic region")  # on several ranks
+ALL = [
+    pytest.param(n, s, marks=() if n in SOME else pytest.mark.serial)
+    for n, c in CASES.items()
+    for s in schemes(c)
+]
+
+
 @pytest.mark.parametrize("balanced", [False, True], ids=["plain", "balanced"])
-@pytest.mark.parametrize("name, scheme", [(n, s) for n, c in CASES.items() for s in schemes(c)])
+@pytest.mark.parametrize("name, scheme", ALL)
 def test_trajectories(comm, name, scheme, balanced):
     """Fields and rates at the end of every window."""
     case = CASES[name]

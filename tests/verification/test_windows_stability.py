@@ -201,7 +201,7 @@ SAMPLES = {
     **{f"3D, scattered, {s}": (lambda s=s: boxes(3, 4, 0.2, s)) for s in range(3)},
     **{f"3D, graded by {g}": (lambda g=g: boxes(3, 4, 0.15, g, g)) for g in (4, 16, 32)},
 }
-QUICK = ("1D, sizes in [1, 3], 0", "1D, graded by 10", "2D, scattered, 0", "3D, scattered, 0")
+QUICK = ("1D, sizes in [1, 3], 0", "1D, graded by 10", "2D, scattered, 0")
 
 
 # In 3D the map of the pair would have 3000 rows.
