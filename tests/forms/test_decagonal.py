@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 
-import dolfinx.fem.petsc
 import numpy as np
 import pytest
 import ufl

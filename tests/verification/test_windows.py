@@ -32,7 +32,6 @@ from complexbody.integrators.asynchronous import AVI
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps, critical_step
 
-
 SOME = ("n3", "n4 blocks", "n4 half of it", "n6 regions", "quartic region")  # on several ranks
 ALL = [
     pytest.param(n, s, marks=() if n in SOME else pytest.mark.serial)
