@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 
+import dolfinx.fem.petsc  # noqa: F401  (fem.petsc is used)
 import numpy as np
 import pytest
 import ufl
