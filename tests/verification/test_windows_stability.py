@@ -230,6 +230,19 @@ def test_no_growth(name, coupled, safety):
 
 
 @pytest.mark.serial
+@pytest.mark.parametrize("safety", [0.45, 0.6])
+@pytest.mark.parametrize(
+    "seed, grade", [(0, 1.0), *(pytest.param(g, g, marks=pytest.mark.slow) for g in (4, 16, 32))]
+)
+def test_no_growth_of_pairs_in_space(seed, grade, safety):
+    """The pair in 3D, on meshes small enough for its map."""
+    mesh = boxes(3, 3, 0.2 if grade == 1 else 0.15, seed, grade)
+    supports = [cb.Fix("u", LEFT), cb.Fix("nu", "boundary")]
+    run = prepared(cb.Scene(mesh, pair(3), supports), AVI(safety=safety), 1e3)
+    assert radius(run) - 1 <= 1e-10
+
+
+@pytest.mark.serial
 @pytest.mark.parametrize("viscosity", [0.3, 3.0, 30.0, 300.0])
 @pytest.mark.parametrize("coupled", [0.0, 0.03, 0.3])
 @pytest.mark.parametrize(
