@@ -11,12 +11,14 @@ from complexbody.body import Body
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
 from complexbody.precheck import realised_speed_up
+from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
-from complexbody.simulate import Result, simulate
+from complexbody.simulate import simulate
 
 __version__ = "0.1.0"
 
@@ -26,6 +28,7 @@ __all__ = [
     "BodyForce",
     "ComplexBodyError",
     "Fix",
+    "Implicit",
     "Initial",
     "LocalLeapfrog",
     "Output",

@@ -67,6 +67,12 @@ def cell_space(domain: mesh.Mesh, shape: tuple[int, ...] = ()) -> fem.FunctionSp
     return fem.functionspace(domain, ("DG", 0, shape) if shape else ("DG", 0))
 
 
+def vertex_space(domain: mesh.Mesh) -> fem.FunctionSpace:
+    """Scalar continuous P1 space, whose interpolation points are the vertices of a cell."""
+    maker = fem.functionspace if hasattr(fem, "functionspace") else fem.FunctionSpace
+    return maker(domain, ("Lagrange", 1))
+
+
 def _table(adjacency: Any, rows: int, columns: int) -> Ints:
     """A dofmap as an int32 array of shape (rows, columns), from an AdjacencyList or an array."""
     flat = adjacency.array if hasattr(adjacency, "array") else np.asarray(adjacency)
@@ -298,3 +304,12 @@ def accumulate(function: fem.Function) -> None:
     mode = la.ScatterMode.add if hasattr(la, "ScatterMode") else la.InsertMode.add
     function.x.scatter_reverse(mode)
     function.x.scatter_forward()
+
+
+def expression_kernel(value: Any, points: Array, comm: Any) -> tuple[Any, Any]:
+    """A UFL expression compiled at reference points: what keeps it alive, and its C function."""
+    options = {"form_compiler_options": {"scalar_type": np.float64}, "jit_options": JIT_OPTIONS}
+    if "form_compiler_params" in inspect.signature(jit.ffcx_jit).parameters:  # up to 0.5
+        options = {"form_compiler_params": {"scalar_type": "double"}, "jit_params": JIT_OPTIONS}
+    made = jit.ffcx_jit(comm, (value, points), **options)
+    return made, made[0].tabulate_tensor_float64

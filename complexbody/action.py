@@ -20,7 +20,8 @@ from dolfinx import fem
 
 from complexbody import _compat
 from complexbody.body import Body
-from complexbody.errors import BodyError, SceneError
+from complexbody.densities import scalar
+from complexbody.errors import SceneError
 from complexbody.scene import BodyForce, Pressure, Scene, Traction
 
 
@@ -29,30 +30,6 @@ def _columns(gradient: Any, rows: Sequence[int], dim: int) -> Any:
     return ufl.as_tensor(
         [[gradient[i, j] if j < dim else ufl.as_ufl(0.0) for j in range(3)] for i in rows]
     )
-
-
-def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a user's density and insist on a scalar UFL expression.
-
-    Raises:
-        BodyError: if it fails or returns something else.
-    """
-    try:
-        value = ufl.as_ufl(function(*arguments))
-    except BodyError:
-        raise
-    except Exception as error:
-        raise BodyError(
-            f"The {what} cannot be evaluated: {type(error).__name__}: {error}. Write it in UFL for "
-            "U of shape (n_u, 3), nu of shape (k,) and N of shape (k, 3)."
-        ) from error
-    if value.ufl_shape != () or value.ufl_free_indices:
-        free = ", with free indices" if value.ufl_free_indices else ""
-        raise BodyError(
-            f"The {what} has shape {value.ufl_shape}{free}, but a density is a scalar. Contract "
-            "its indices, for instance with ufl.inner."
-        )
-    return value
 
 
 class Action:

@@ -176,6 +176,24 @@ def _integrator(to: argparse.ArgumentParser) -> None:
         help="local-leapfrog: ν of the Chebyshev filter; default 0.15, 0 is none",
     )  # fmt: skip
     group.add_argument(
+        "--order", type=int, choices=(1, 2),
+        help="implicit: midpoint (2, default) or the paper's scheme (1)",
+    )  # fmt: skip
+    group.add_argument(
+        "--quadrature", choices=("vertex", "consistent"),
+        help="implicit: a Newton at each node (default), or SNES with χ integrated in full",
+    )  # fmt: skip
+    group.add_argument(
+        "--tolerance", metavar="EPS", type=float, help="implicit: of the residual; default 1e-12"
+    )
+    group.add_argument(
+        "--monitor", action="store_true", default=None, help="implicit: print SNES's residuals"
+    )
+    group.add_argument(
+        "--petsc", metavar="NAME=VALUE", action="append", default=[],
+        help="implicit: a PETSc option of SNES, such as ksp_type=gmres; repeatable",
+    )  # fmt: skip
+    group.add_argument(
         "--levels", metavar="L", type=int,
         help="local-leapfrog: octaves of smaller steps; default: as many as cost the least",
     )  # fmt: skip

@@ -26,6 +26,7 @@ from complexbody import machine, precheck, report
 from complexbody.errors import CommandError, MissingPackage
 from complexbody.files import on_first_rank
 from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
@@ -33,16 +34,20 @@ from complexbody.output import NODE_FIELDS, Output, Probes
 from complexbody.precheck import realised_speed_up
 from complexbody.problem import Problem
 from complexbody.rendering import require_vtk
+from complexbody.result import Result
 from complexbody.scene import Scene
 from complexbody.scenefile import CheckFailed, SceneFile, assignments, points
-from complexbody.simulate import Result, Simulation, default_ledger_steps
+from complexbody.simulate import Simulation, default_ledger_steps
 from complexbody.together import Interrupted, say, together
 
 #: Integrators by the name that --integrator takes; the first is the default.
-INTEGRATORS = {"synchronous": Synchronous, "avi": AVI, "local-leapfrog": LocalLeapfrog}
+INTEGRATORS = {
+    "synchronous": Synchronous, "avi": AVI, "local-leapfrog": LocalLeapfrog, "implicit": Implicit,
+}  # fmt: skip
 _OPTIONS = (
     "step", "safety", "dissipation", "start", "critical", "unstable_ok", "schedule", "balanced",
-    "corrected", "stabilisation", "levels",
+    "corrected", "stabilisation", "levels", "order", "quadrature", "tolerance", "iterations",
+    "monitor", "options",
 )  # fmt: skip
 
 
@@ -113,6 +118,9 @@ def _settings(a: argparse.Namespace, file: SceneFile) -> dict[str, Any]:
     rows = settings.get("ledger_steps", 1)
     if not isinstance(rows, int) or rows < 1:
         raise CommandError(f"ledger_steps is {rows!r}. Give a whole number from 1.")
+    if given.get("petsc"):
+        given_options = assignments(given["petsc"])
+        settings["options"] = {name: str(value) for name, value in given_options.items()}
     if given.get("probe"):
         settings["probes"] = {**settings.get("probes", {}), **points(given["probe"])}
     return settings

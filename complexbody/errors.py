@@ -60,6 +60,17 @@ class DivergenceError(ComplexBodyError, ArithmeticError):
     exit_code = 4
 
 
+class SolverError(ComplexBodyError, ArithmeticError):
+    """An implicit step has no (unique) solution, or a solver did not find it.
+
+    Attributes:
+        result: The Result at the last good time, where a simulation was under way.
+    """
+
+    exit_code = 4
+    result: Any = None
+
+
 def agree(comm: Any, error: Exception | None) -> None:
     """Raise on all ranks of ``comm`` if any rank holds an error; collective.
 

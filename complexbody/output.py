@@ -21,7 +21,8 @@ from dolfinx import fem
 
 from complexbody import _compat
 from complexbody._compat import Array
-from complexbody.action import Action, scalar
+from complexbody.action import Action
+from complexbody.densities import scalar
 from complexbody.errors import OutputError, SceneError
 from complexbody.files import CsvWriter, Series, in_input_order, on_first_rank
 from complexbody.probes import Probes

@@ -24,7 +24,7 @@ from complexbody.problem import Problem
 from complexbody.timesets import cell_steps
 
 if TYPE_CHECKING:
-    from complexbody.simulate import Result
+    from complexbody.result import Result
 
 Array = npt.NDArray[np.float64]
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from dolfinx import fem
 
 from complexbody import _compat, boundary, hessian, native
 from complexbody.action import Action
+from complexbody.body import Body
+from complexbody.convexity import Convexity, Range
 from complexbody.discretisation import Discretisation
 from complexbody.errors import agree
 from complexbody.kernels.library import Kernels
@@ -34,6 +37,10 @@ class Problem:
         supports, loads: In geometry nodes.
         moving: (node, component) of supports that move, sorted by node; own numbering.
         load_position, load_group, load_value: Entries of load vectors in flat node records.
+        inertias: The bodies as the user gave them: of those with a general χ(ν, ν̇), ``scene`` has
+            the lower bound γI in its place.
+        convexity, kinetic_range: Of general χ: how γ, Ξ and T₀ are measured (None if there is no
+            such χ), and what they are at the initial state.
         warnings: What A1 leaves to the boundary data, in words.
 
     Raises:
@@ -51,8 +58,39 @@ class Problem:
         self.supports = boundary.supports(scene, self.action)
         self.loads = boundary.loads(scene, self.action)
         self._start = boundary.initial(scene, self.action)
+        self._read_inertia()
         self.arrange()
         self.warnings = self._check_energy()
+
+    def _read_inertia(self) -> None:
+        """Convexity of a general χ at the initial state; its γ stands for it in all layers below.
+
+        The scene of those layers has γI for the inertia of such a body: a lower bound, so that
+        critical steps are safe at the start.
+        """
+        self.convexity: Convexity | None = None
+        self.kinetic_range = Range()
+        self.inertias = self.scene.bodies
+        if not any(callable(body.inertia) for body in self.inertias):
+            return
+        self.convexity = Convexity(self.scene)
+        fields, rates = (a.copy() for a in self._start)
+        rows, columns = np.nonzero(self.supports.fixed)
+        fields[rows, columns] = self.supports.targets(rows, columns, 0.0)
+        rates[rows, columns] = 0.0
+        nu = self.scene.components_of("nu")
+        found = self.convexity.measure(fields[:, nu], rates[:, nu])
+        for part in found.values():
+            self.kinetic_range.widen(part)
+        bodies = [
+            replace(b, inertia=found[r].gamma) if r in found else b
+            for r, b in enumerate(self.inertias)
+        ]
+        body = self.scene.body
+        tagged: Body | dict[int, Body] = bodies[0]
+        if not isinstance(body, Body):
+            tagged = dict(zip(sorted(body), bodies, strict=True))
+        self.scene = replace(self.scene, body=tagged)
 
     def arrange(self, group: npt.NDArray[np.int64] | None = None) -> None:
         """Lay out cells and nodes (anew), cells of one block being of one group; collective.

@@ -20,8 +20,8 @@ from complexbody.body import Body
 from complexbody.integrators.timetable import TimeSets
 from complexbody.output import Output
 from complexbody.precheck import Limits
+from complexbody.result import Result, Statistics
 from complexbody.scene import Scene
-from complexbody.simulate import Result, Statistics
 
 
 def entry(name: str, text: str) -> str:
@@ -167,6 +167,7 @@ def after(result: Result) -> list[str]:
     return [
         entry("time", times),
         entry("rate", f"{s.rate / s.ranks / 1e6:.3g} million cell updates per second and core"),
+        *([entry("solving", result.solving)] if result.solving else []),
         entry("ledger", ledger.summary(result.ledger)),
     ]
 

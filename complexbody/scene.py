@@ -17,6 +17,7 @@ from complexbody import _compat
 from complexbody.body import Body
 from complexbody.errors import MeshError, SceneError, agree
 from complexbody.histories import Constant, History
+from complexbody.kinetics import recognised
 
 #: A facet tag, several of them, "boundary", or a predicate of x (3, npts) -> bool (npts,).
 Where = int | Sequence[int] | str | Callable[[Any], Any]
@@ -143,6 +144,7 @@ class Scene:
         _compat.equispaced(self.mesh)
         self._check_tag_kinds()
         self._check_bodies()
+        self._recognise()
         self._check_tags()
         if not isinstance(self.initial, Initial):
             raise SceneError("Scene: initial is not an Initial. Give initial=cb.Initial(u=…).")
@@ -240,6 +242,14 @@ class Scene:
                 raise SceneError(
                     f"Scene: no cell has tag {tag}, for which a body is given. Check cell_tags."
                 )
+
+    def _recognise(self) -> None:
+        """Give bodies whose χ(ν, ν̇) is ½ν̇·Ων̇ that Ω for their inertia."""
+        if isinstance(self.body, Body):
+            object.__setattr__(self, "body", recognised(self.body, self.mesh))
+        elif any(callable(body.inertia) for body in self.body.values()):
+            known = {tag: recognised(body, self.mesh) for tag, body in self.body.items()}
+            object.__setattr__(self, "body", known)
 
     def _check_tag_kinds(self) -> None:
         cell = self.mesh.topology.dim

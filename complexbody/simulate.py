@@ -8,91 +8,34 @@ the cubic Hermite interpolant of fields and rates, whose error is of higher orde
 from __future__ import annotations
 
 import time as clock
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem
 from mpi4py import MPI
 
-from complexbody.errors import SceneError
+from complexbody.errors import SceneError, SolverError
 from complexbody.files import CsvWriter
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
+from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
-from complexbody.integrators.timetable import TimeSets
-from complexbody.ledger import Bookkeeper, Ledger
+from complexbody.ledger import Bookkeeper
 from complexbody.output import Output, Writer
 from complexbody.problem import Problem
 from complexbody.progress import Progress
 from complexbody.receivers import Receivers
+from complexbody.result import Result, Statistics
 from complexbody.scene import Scene
-from complexbody.timesets import require_constant_inertia
 
 Array = npt.NDArray[np.float64]
-
-
-@dataclass
-class Statistics:
-    """What a run cost.
-
-    Attributes:
-        step, critical: Step and critical step [s]; steps: number of steps.
-        cells, nodes: Of the whole body; ranks: processes.
-        updates: Cell updates of all ranks; rate: per second of stepping.
-        set_up, stepping, booking, writing: Seconds of the slowest rank.
-        bytes_per_cell: Memory beside dolfinx's own mesh.
-    """
-
-    step: float = 0.0
-    critical: float = 0.0
-    steps: int = 0
-    cells: int = 0
-    nodes: int = 0
-    ranks: int = 1
-    updates: int = 0
-    rate: float = 0.0
-    set_up: float = 0.0
-    stepping: float = 0.0
-    booking: float = 0.0
-    writing: float = 0.0
-    bytes_per_cell: float = 0.0
-
-
-@dataclass
-class Result:
-    """A finished run: fields at the final time, ledger, probes, statistics.
-
-    Attributes:
-        u, nu, u_dot, nu_dot: dolfinx Functions, all at ``time`` [s].
-        ledger: Energies and momenta; ``ledger["stored"]`` is a column.
-        probes: {name: {"time": (m,), "u": (m, n_u), "nu": (m, k)}} on rank 0, empty elsewhere.
-        stats: What it cost.
-        scene: What was simulated; folder: where output went, or None.
-        integrator: How.
-        time_sets: Who acted when, and what that saves; None where all cells act together.
-    """
-
-    u: fem.Function
-    nu: fem.Function
-    u_dot: fem.Function
-    nu_dot: fem.Function
-    time: float
-    ledger: Ledger
-    stats: Statistics
-    scene: Scene
-    probes: dict[str, dict[str, Array]] = field(default_factory=dict)
-    folder: Path | None = None
-    integrator: Any = None
-    time_sets: TimeSets | None = None
+Integrator = Synchronous | AVI | LocalLeapfrog | Implicit
 
 
 def simulate(
     scene: Scene,
-    integrator: Synchronous | AVI | LocalLeapfrog | None = None,
+    integrator: Integrator | None = None,
     *,
     until: float,
     output: Output | None = None,
@@ -139,7 +82,7 @@ class Simulation:
     def __init__(
         self,
         scene: Scene,
-        integrator: Synchronous | AVI | LocalLeapfrog | None = None,
+        integrator: Integrator | None = None,
         *,
         until: float,
         output: Output | None = None,
@@ -156,7 +99,6 @@ class Simulation:
             raise SceneError(f"simulate: ledger_steps is {ledger_steps}. Give 1 or more.")
         self.method = method = integrator or Synchronous()
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
-        require_constant_inertia(scene, type(method).__name__)
         self.problem = Problem(scene)
         self.run_: Run = method.prepare(self.problem, until)
         self.last = int(np.ceil(until / self.run_.step - 1e-9))
@@ -176,6 +118,7 @@ class Simulation:
             ledger = self.books.ledger
             columns = dict(zip(ledger.columns, ledger.units(), strict=True))
             self.csv = CsvWriter(Path(output.folder) / "ledger.csv", columns, self.comm)
+        self._written = -1.0
         self.progress = Progress(self.comm, until, progress)
         self._statistics()
         self.every = ledger_steps or default_ledger_steps(
@@ -202,11 +145,16 @@ class Simulation:
 
         Raises:
             DivergenceError: if the run blew up.
+            SolverError: if an implicit step has no solution; the last state is written as output,
+                and is ``result`` of the error.
             OutputError: if results cannot be written any more.
         """
         try:
             self._loop()
             return self._result()
+        except SolverError as error:
+            error.result = self._keep()
+            raise
         finally:
             self._close()
 
@@ -282,11 +230,18 @@ class Simulation:
         v0 = 2 * kernels.v - v1
         return hermite((self.until - run.time + h) / h, h, x0, v0, x1, v1)
 
+    def _keep(self) -> Result:
+        """The state before the step that failed, written and returned."""
+        # Rates at its own time may have no solution either: those of the last drift do.
+        return self._made(self.run_.time, self.run_.positions(), self.problem.kernels.v)
+
     def _result(self) -> Result:
         self._book()
-        x, rates = self._final()
-        if self.writer is not None:
-            self._write(self.until, x, rates)
+        return self._made(self.until, *self._final())
+
+    def _made(self, t: float, x: Array, rates: Array) -> Result:
+        if self.writer is not None and t > self._written:
+            self._write(t, x, rates)
         self._fill(x, rates)
         f, s = self.functions, self.stats
         s.steps = self.run_.steps
@@ -298,8 +253,8 @@ class Simulation:
         probes = self.receivers.table() if self.receivers is not None else {}
         fields = (f["u"], f["nu"], f["u_dot"], f["nu_dot"])
         return Result(
-            *fields, self.until, self.books.ledger, s, self.scene, probes, folder, self.method,
-            self.run_.time_sets,
+            *fields, t, self.books.ledger, s, self.scene, probes, folder, self.method,
+            self.run_.time_sets, getattr(self.run_, "summary", str)(),
         )  # fmt: skip
 
     # --- what leaves the run -------------------------------------------------------------------
@@ -317,6 +272,7 @@ class Simulation:
         if self.writer is not None:
             self._fill(x, rates)
             self.writer.write(t, self.functions)
+            self._written = t
         self.stats.writing += clock.perf_counter() - begun
 
     def _book(self) -> None:

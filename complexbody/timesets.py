@@ -21,7 +21,6 @@ from complexbody.kernels.ffcx import Tabulated
 from complexbody.kernels.pencil import matrix_eigenvalues, quadratic_eigenvalues
 from complexbody.masses import effective, pencil_basis
 from complexbody.problem import Problem
-from complexbody.scene import Scene
 
 Array = npt.NDArray[np.float64]
 
@@ -273,15 +272,15 @@ def critical_step(problem: Problem, scheme: str = "exact", how: str = "cells") -
     return step
 
 
-def require_constant_inertia(scene: Scene, integrator: str) -> None:
-    """Refuse bodies whose kinetic co-energy is a function of (ν, ν̇).
+def require_constant_inertia(problem: Problem, integrator: str) -> None:
+    """Refuse bodies whose kinetic co-energy is a function of (ν, ν̇), recognised as no Ω.
 
     Raises:
         IntegratorError: naming the body and the integrators that take it.
     """
-    for body in scene.bodies:
+    for body in problem.inertias:
         if callable(body.inertia):
             raise IntegratorError(
                 f"{integrator} needs a constant inertia, but that of {body.name} is a function of "
-                "(nu, nu_dot). Give a number or a k×k matrix."
+                "(nu, nu_dot). Use Implicit(), or give a number or a k×k matrix."
             )

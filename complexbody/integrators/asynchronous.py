@@ -23,7 +23,7 @@ from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions, graded, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
-from complexbody.timesets import cell_steps
+from complexbody.timesets import cell_steps, require_constant_inertia
 
 Array = npt.NDArray[np.float64]
 SCHEDULES = ("windows", "exact", "octaves")
@@ -143,6 +143,7 @@ class AVI:
             IntegratorError: for bodies this integrator cannot take.
             StepError: for ``steps`` that are not one per cell, positive, and stable.
         """
+        require_constant_inertia(problem, "AVI")
         critical = cell_steps(problem, self.dissipation)
         disc = problem.disc
         real = disc.source_cell >= 0

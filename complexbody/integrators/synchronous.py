@@ -16,7 +16,7 @@ from complexbody.errors import IntegratorError, StepError
 from complexbody.integrators.synchronous_run import SynchronousRun
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
-from complexbody.timesets import critical_step
+from complexbody.timesets import critical_step, require_constant_inertia
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ class Synchronous:
             StepError: if the step is above the critical one and ``unstable_ok`` is False.
             IntegratorError: if the body does not fit the dissipation scheme.
         """
+        require_constant_inertia(problem, "Synchronous")
         critical = critical_step(problem, self.dissipation, self.critical)
         step = self.step
         if step is None:

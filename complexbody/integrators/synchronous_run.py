@@ -17,8 +17,8 @@ from mpi4py import MPI
 from complexbody import native
 from complexbody.errors import IntegratorError
 from complexbody.integrators.entries import Entries
+from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.synchronous_books import entries
-from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -27,21 +27,18 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 
-class SynchronousRun:
+class SynchronousRun(ForceRun):
     """A synchronous run in progress.
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
         updates: Cell updates done by this rank.
-        time_sets: None: all act together.
         support_work: Work of this rank's moving supports in the half step before a sample [J].
     """
 
-    time_sets: TimeSets | None = None
-
     def __init__(self, problem: Problem, method: Synchronous, step: float, critical: float) -> None:
-        self.problem, self.method, self.step, self.critical = problem, method, step, critical
-        self.steps, self.updates, self.ready = 0, 0, False
+        super().__init__(problem, step, critical)
+        self.method = method
         disc, kernels, masses = problem.disc, problem.kernels, problem.masses
         if not masses.diagonal:  # the same on all ranks, unlike what moves there
             self._refuse_partial()
@@ -74,11 +71,6 @@ class SynchronousRun:
         self.support_work = 0.0
         kernels.reset_forces()
 
-    @property
-    def time(self) -> float:
-        """t_n = n h [s], from the counter: never summed up."""
-        return self.steps * self.step
-
     def _refuse_partial(self) -> None:
         n_u, (rows, columns) = self.problem.scene.displacement, self.problem.moving
         masses, nodes = self.problem.masses, rows[columns >= n_u]
@@ -88,42 +80,6 @@ class SynchronousRun:
                 "A moving support prescribes some components of a descriptor whose inertia or "
                 "viscosity couples them. Prescribe all components there, or diagonalise the matrix."
             )
-
-    # --- forces at t_n -----------------------------------------------------------------------
-
-    def forces(self) -> None:
-        """Bring f to the forces at (x_n, t_n), summed over ranks; once per step at most."""
-        if self.ready:
-            return
-        problem = self.problem
-        problem.load_forces(self.amplitude(self.time))
-        self.c.cb_forces(self.state)
-        self.updates += problem.disc.count
-        if problem.comm.size > 1:
-            self._exchange_begin()
-            self._exchange_end()
-        self.ready = True
-
-    def amplitude(self, t: float) -> Array:
-        """Factors of the loads' groups at t [s]."""
-        return self.problem.loads.amplitudes(np.array([t]))[0]
-
-    def _exchange_begin(self) -> None:
-        halo, disc, kernels = self.problem.disc.halo, self.problem.disc, self.problem.kernels
-        self.c.cb_pack(
-            ctypes.c_int64(len(halo.sends)), native.pointer(halo.sends),
-            ctypes.c_void_p(kernels.f.ctypes.data + disc.late * disc.record * 8),
-            native.pointer(halo.outgoing),
-        )  # fmt: skip
-        halo.begin()
-
-    def _exchange_end(self) -> None:
-        halo, disc, kernels = self.problem.disc.halo, self.problem.disc, self.problem.kernels
-        halo.end()
-        self.c.cb_sum_shared(
-            ctypes.c_int64(disc.shared), ctypes.c_int64(disc.late), native.pointer(halo.start),
-            native.pointer(halo.source), native.pointer(halo.incoming), native.pointer(kernels.f),
-        )  # fmt: skip
 
     # --- steps -------------------------------------------------------------------------------
 
@@ -284,13 +240,6 @@ class SynchronousRun:
             v0[mask] = rates[mask]
         return v0
 
-    def positions(self) -> Array:
-        """(u, ν) at t_n, node records."""
-        return self.problem.kernels.x
-
     def entries(self) -> Entries:
         """Energies and works at t_n, and the discrete energy of the last half step; collective."""
         return entries(self)
-
-    def close(self) -> None:
-        """Do nothing: messages are the problem's."""

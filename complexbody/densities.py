@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Calling a user's density: a scalar UFL expression, or a clear error."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import ufl
+
+from complexbody.errors import BodyError
+
+
+def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a user's density and insist on a scalar UFL expression.
+
+    Raises:
+        BodyError: if it fails or returns something else.
+    """
+    try:
+        value = ufl.as_ufl(function(*arguments))
+    except BodyError:
+        raise
+    except Exception as error:
+        raise BodyError(
+            f"The {what} cannot be evaluated: {type(error).__name__}: {error}. Write it in UFL for "
+            "U of shape (n_u, 3), nu of shape (k,) and N of shape (k, 3)."
+        ) from error
+    if value.ufl_shape != () or value.ufl_free_indices:
+        free = ", with free indices" if value.ufl_free_indices else ""
+        raise BodyError(
+            f"The {what} has shape {value.ufl_shape}{free}, but a density is a scalar. Contract "
+            "its indices, for instance with ufl.inner."
+        )
+    return value

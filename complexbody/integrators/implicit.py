@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+r"""The implicit synchronous integrator, as the user says it: any kinetic co-energy χ(ν, ν̇).
+
+Discrete Lagrangian L_d = h χ(ν + s h v, v) − potential, v = (ν⁺ − ν)/h: s = 0 is the paper's scheme
+(§5, (Discr-dAL2s) with the dissipation's sign corrected, order 1), s = ½ the midpoint rule with
+potentials by the trapezoidal rule (order 2). Forces stay explicit, and so does u.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from complexbody.errors import IntegratorError, StepError
+from complexbody.integrators.implicit_run import ImplicitRun
+from complexbody.integrators.synchronous import Synchronous
+from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.problem import Problem
+from complexbody.timesets import critical_step
+
+
+@dataclass(frozen=True)
+class Implicit:
+    r"""Synchronous variational integrator for ``inertia=f(nu, nu_dot)``.
+
+    With p = ∂χ/∂ν̇ and q = ∂χ/∂ν at (ν + s h v, v) a step solves
+
+    .. math:: p - (1-s)\,h q + (1-s)\,h\eta v = \pi - h\,\partial V/\partial\nu,\qquad
+              \pi^+ = p + s h q - s h\eta v,\quad \nu^+ = \nu + h v.
+
+    Where all bodies of a scene have a constant inertia (or a χ recognised as such) and masses are
+    lumped nothing needs solving: the run is the one of :class:`Synchronous`.
+
+    Attributes:
+        step: Step h [s]; by default ``safety`` times the critical step of the explicit forces, at
+            most half of T₀.
+        order: 2 (midpoint) or 1 (the paper's).
+        quadrature: "vertex": χ by the vertex rule, a k×k Newton at each node; "consistent": χ
+            integrated in full, a global SNES (options with prefix ``cb_implicit_``).
+        safety: Fraction of the critical step to use.
+        solve: "needed", or "always": also where χ is quadratic.
+        tolerance: Residual of a step, relative to its largest term.
+        iterations: Newton iterations allowed per step.
+        monitor: Print SNES's residuals.
+        options: More PETSc options, without the prefix.
+        unstable_ok: Run even with a step above the critical one or T₀.
+
+    Raises:
+        IntegratorError: for options that do not exist.
+        StepError: for a step, safety or tolerance that is not positive.
+    """
+
+    step: float | None = None
+    order: int = 2
+    quadrature: str = "vertex"
+    safety: float = 0.9
+    solve: str = "needed"
+    tolerance: float = 1e-12
+    iterations: int = 50
+    monitor: bool = False
+    options: Mapping[str, str] = field(default_factory=dict)
+    unstable_ok: bool = False
+
+    explicit: ClassVar[bool] = False
+    asynchronous: ClassVar[bool] = False
+    symplectic: ClassVar[bool] = True
+    inertia: ClassVar[str] = "number, k×k matrix, or f(nu, nu_dot) convex in nu_dot"
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("order", (1, 2)), ("quadrature", ("vertex", "consistent")),
+            ("solve", ("needed", "always")),
+        ):  # fmt: skip
+            if getattr(self, name) not in allowed:
+                raise IntegratorError(
+                    f"Implicit: {name}={getattr(self, name)!r} is not known. Give one of "
+                    f"{', '.join(map(str, allowed))}."
+                )
+        for name in ("step", "safety", "tolerance", "iterations"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value > 0):
+                raise StepError(f"Implicit: {name} is {value}. Give a positive number.")
+
+    def prepare(self, problem: Problem, until: float) -> ImplicitRun | SynchronousRun:
+        """Choose the step and set up the run; collective.
+
+        Raises:
+            StepError: if the step is above the critical one or T₀ and ``unstable_ok`` is False.
+            IntegratorError: for a scene this integrator cannot take.
+        """
+        scheme, start = (
+            ("forward", "one-sided") if self.order == 1 else ("symmetric", "trapezoidal")
+        )
+        general = problem.convexity is not None
+        if not general and self.solve == "needed" and self.quadrature == "vertex":
+            same = Synchronous(self.step, self.safety, scheme, start, unstable_ok=self.unstable_ok)
+            return same.prepare(problem, until)
+        if np.any(np.linalg.eigvalsh(problem.masses.inertia) <= 0):
+            raise IntegratorError(
+                "Implicit solves for momenta, which a descriptor without inertia does not have. "
+                "Use Synchronous() or AVI() with dissipation='exact'."
+            )
+        critical = self._critical(problem, scheme)
+        if self.quadrature == "consistent":
+            # A cell's consistent mass is at least its lumped one over d + 2.
+            critical /= float(np.sqrt(problem.disc.dim + 2))
+        limit = problem.kinetic_range.limit(self.order)
+        step = self.step
+        if step is None:
+            step = min(self.safety * critical, 0.5 * limit, until)
+            step = until / np.ceil(until / step * (1 - 1e-12))
+        for bound, what in ((critical, "the critical step"), (limit, "T₀ = γ/Ξ of the inertia")):
+            if step > bound * (1 + 1e-9) and not self.unstable_ok:
+                raise StepError(
+                    f"The step {step:.6g} s is larger than {what}, {bound:.6g} s at the initial "
+                    "state. Give a smaller step, or unstable_ok=True to see what happens."
+                )
+        return ImplicitRun(problem, self, float(step), float(critical))
+
+    def _critical(self, problem: Problem, scheme: str) -> float:
+        try:
+            return critical_step(problem, scheme)
+        except StepError:
+            # A body without stiffness has no critical step; one that the user gives will do.
+            if self.step is None:
+                raise
+            return float("inf")
