@@ -332,9 +332,11 @@ def test_refusals(comm, shared_path):
     for name in ("dissipation", "start", "critical"):
         with refused(IntegratorError, name, "quick"):
             cb.Synchronous(**{name: "quick"})
-    body = cb.Body(1, lambda U, nu, N: ufl.inner(U, U), 1.0, lambda nu, v: 0.5 * v[0] ** 2)
-    with refused(IntegratorError, "constant inertia", "Synchronous"):
-        cb.simulate(cb.Scene(scene.mesh, body), until=1.0)
+    chi = lambda nu, v: (1 + nu[0] ** 2) * v[0] ** 2  # noqa: E731
+    body = cb.Body(1, lambda U, nu, N: ufl.inner(U, U) + ufl.inner(N, N), 1.0, chi, displacement=1)
+    for method in (cb.Synchronous(), cb.AVI(), cb.LocalLeapfrog()):
+        with refused(IntegratorError, "constant inertia", type(method).__name__, "Implicit()"):
+            cb.simulate(cb.Scene(scene.mesh, body), method, until=1.0)
     file = shared_path / "file"
     if comm.rank == 0:
         file.write_text("in the way")
