@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 PREFIX = "cb_implicit_"
-DEFAULTS = {"snes_type": "newtonls", "snes_linesearch_type": "bt", "ksp_rtol": "1e-8",
-            "pc_type": "jacobi"}  # fmt: skip
+DEFAULTS = {"snes_type": "newtonls", "snes_linesearch_type": "bt", "ksp_rtol": "1e-6",
+            "pc_type": "sor"}  # fmt: skip
 
 #: SNESConvergedReason below zero, in words.
 REASONS = {
