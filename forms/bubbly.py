@@ -32,7 +32,8 @@ so that, exactly, q²/ω² = ρ/K + ρa²/(w'' − mω² − iωη). The body's 
 
 Ka² shifts neither ω0 nor any other term of it: it is the gap's upper edge ω0² + 4πnR0c², where
 q = 0 and where bubbles in a liquid at rest as a whole oscillate. Without shear stiffness,
-transverse motions have no frequency. Left out: heat, radiation by a single bubble, surface tension.
+transverse motions have no frequency, and e alone does not see div u = aν, which w holds: a scene
+warns of that mode. Left out: heat, radiation by a single bubble, surface tension.
 
 Sources (recalled, not re-read): Minnaert 1933; Caflisch, Miksis, Papanicolaou and Ting 1985;
 Commander and Prosperetti 1989.

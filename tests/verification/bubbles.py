@@ -52,15 +52,16 @@ class Bubble:
     def period(self, start):
         """Period after release from rest at start, by quadrature: R = mid − half cos θ."""
         low, high = sorted((start, self.turning(start)))
+        x, w = np.polynomial.legendre.leggauss(40)
         mid, half = 0.5 * (low + high), 0.5 * (high - low)
 
         def slowness(t):
             R = mid - half * np.cos(t)
             # V(low) − V(R) by quadrature of the force: the difference would cancel at the ends
-            near, far = (low, R) if t < np.pi / 2 else (R, high)
-            x, w = np.polynomial.legendre.leggauss(40)
-            nodes = 0.5 * (near + far) + 0.5 * (far - near) * x
-            drop = 0.5 * (far - near) * (w @ self.force(nodes)) * (-1 if t < np.pi / 2 else 1)
+            first = t < np.pi / 2
+            width = half * np.sin(0.5 * t if first else 0.5 * (np.pi - t)) ** 2
+            nodes = (low + width * (1 + x)) if first else (high - width * (1 + x))
+            drop = width * (w @ self.force(nodes)) * (-1 if first else 1)
             return half * np.sin(t) * np.sqrt(0.5 * self.rho * R**3 / drop)
 
         parts = [quad(slowness, a, a + np.pi / 2, epsabs=0, epsrel=1e-11)[0] for a in (0, np.pi / 2)]
