@@ -124,7 +124,7 @@ def bubbly_liquid(
         sound_speed: c [m/s] of the pure liquid, K = ρ_l c².
         pressure: p0 [Pa], at rest, in the liquid as in the gas.
         gamma: γ of the gas.
-        viscosity: μ [Pa·s] of the liquid; η = 16πnμR0 [kg/(m³s)·m²/m²]. Water has 1e-3.
+        viscosity: μ [Pa·s] of the liquid; η = 16πnμR0 [kg/(m³s)]. Water has 1e-3.
         d: Number of components of u, 1 to 3; at least the dimension of the mesh.
         linearised: Whether χ and w are replaced by their quadratic parts.
         name: What to call it.
@@ -189,8 +189,13 @@ def bubbly_dispersion(
 
     Args:
         omega: ω [rad/s], a number or an array.
-        radius, void_fraction, density, sound_speed, pressure, gamma, viscosity: As in
-            :func:`bubbly_liquid`.
+        radius: R0 [m].
+        void_fraction: β.
+        density: ρ_l [kg/m³].
+        sound_speed: c [m/s] of the pure liquid.
+        pressure: p0 [Pa].
+        gamma: γ of the gas.
+        viscosity: μ [Pa·s] of the liquid.
 
     Returns:
         q² in the shape of ω: real if μ = 0 and ω is real (negative where nothing propagates),
@@ -230,6 +235,18 @@ def bubbly_branches(
     """The two undamped frequencies [rad/s] at wave number q [1/m], below and above the gap.
 
     The roots of ω⁴ − ω²(ω0² + 4πnR0c² + q²c²) + q²c²ω0² = 0, the relation at the top solved for ω.
+
+    Args:
+        q: Wave number, a number or an array.
+        radius: R0 [m].
+        void_fraction: β.
+        density: ρ_l [kg/m³].
+        sound_speed: c [m/s] of the pure liquid.
+        pressure: p0 [Pa].
+        gamma: γ of the gas.
+
+    Returns:
+        Both in the shape of q.
 
     Raises:
         BodyError: as in :func:`bubbly_liquid`.

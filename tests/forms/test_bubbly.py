@@ -57,7 +57,7 @@ def test_linearised_is_the_second_order():
 @pytest.mark.serial
 @pytest.mark.parametrize("viscosity", [0.0, 0.003])
 def test_dispersion_is_the_bodys(viscosity, value, hessian):
-    """det(K(q) − iωD − ω²M) = 0 of the linearised body in 3D, and Commander and Prosperetti's q²."""
+    """det(K(q) − iωD − ω²M) = 0 of the linearised body in 3D; Commander-Prosperetti's form."""
     body = bubbly_liquid(**SCALED, viscosity=viscosity, linearised=True)
     e = lambda g, v: value(body.energy, np.diag([g, 0, 0]), [v], np.zeros((1, 3)))  # noqa: E731
     uu, nn = 2 * e(1, 0), 2 * e(0, 1) + 2 * float(body.potential(vector(0, 0, 0), vector(1)))
@@ -104,9 +104,7 @@ def test_standing_wave(comm, branch):
             meshes.interval(comm, 0, 1, cells),
             body,
             [cb.Fix("u", "boundary")],
-            initial=cb.Initial(
-                lambda x: np.sin(q * x[:1]), lambda x: ratio * np.cos(q * x[:1])
-            ),
+            initial=cb.Initial(lambda x: np.sin(q * x[:1]), lambda x: ratio * np.cos(q * x[:1])),
         )
         run = prepared(scene, cb.Synchronous(0.32 / cells))
         run.advance(5 * cells)

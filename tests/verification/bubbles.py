@@ -2,8 +2,8 @@
 r"""Radial motion of one bubble, from Rayleigh's equation alone: no mesh, no body.
 
 ρ(RR̈ + 3Ṙ²/2) = p_g0(R0/R)^{3γ} − p∞ − 4μR0Ṙ/R² − S(R − R0)R0²/R². S [Pa/m] is the pressure of a
-surrounding liquid of stiffness K kept from moving, S = 4πnR0²K, with its work taken on 4πR0²ν; S = 0
-is the free bubble. Viscosity is that of a constant coefficient 16πμR0 of Ṙ per bubble.
+surrounding liquid of stiffness K kept from moving, S = 4πnR0²K, with its work taken on 4πR0²ν;
+S = 0 is the free bubble. Viscosity is that of a constant coefficient 16πμR0 of Ṙ per bubble.
 Energy per 4π: ½ρR³Ṙ² + V(R), dV/dR = −R²(p_g0(R0/R)^{3γ} − p∞) + S R0²(R − R0).
 """
 
@@ -26,7 +26,7 @@ class Bubble:
         return -(R**2) * gas + self.S * self.R0**2 * (R - self.R0)
 
     def V(self, R):
-        """V(R), with V(R0) whatever it is."""
+        """Potential energy per 4π of one bubble; not zero at rest."""
         gas = (self.R0 / R) ** (3 * self.gamma) / (self.gamma - 1)
         elastic = 0.5 * self.S * self.R0**2 * (R - self.R0) ** 2
         return self.p0 * R**3 / 3 * (1 + gas) + elastic
@@ -64,7 +64,9 @@ class Bubble:
             drop = width * (w @ self.force(nodes)) * (-1 if first else 1)
             return half * np.sin(t) * np.sqrt(0.5 * self.rho * R**3 / drop)
 
-        parts = [quad(slowness, a, a + np.pi / 2, epsabs=0, epsrel=1e-11)[0] for a in (0, np.pi / 2)]
+        parts = [
+            quad(slowness, a, a + np.pi / 2, epsabs=0, epsrel=1e-11)[0] for a in (0, np.pi / 2)
+        ]
         return 2 * sum(parts)
 
     def trajectory(self, start, times, rate=0.0):
@@ -78,9 +80,7 @@ class Bubble:
 
         absolute = 1e-13 * np.array([self.R0, self.R0 * self.frequency])
         span = (0.0, times[-1])
-        answer = solve_ivp(
-            right, span, [start, rate], "DOP853", times, rtol=1e-12, atol=absolute
-        )
+        answer = solve_ivp(right, span, [start, rate], "DOP853", times, rtol=1e-12, atol=absolute)
         assert answer.success
         return answer.y
 
