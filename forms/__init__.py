@@ -5,6 +5,12 @@ Each function returns a :class:`complexbody.body.Body` or raises a
 :class:`~complexbody.errors.BodyError` that names the inequality its constants break.
 """
 
+from complexbody.forms.bubbly import (
+    bubbly_branches,
+    bubbly_dispersion,
+    bubbly_liquid,
+    minnaert,
+)
 from complexbody.forms.decagonal import decagonal_quasicrystal
 from complexbody.forms.hexagonal import hexagonal_quasicrystal
 from complexbody.forms.icosahedral import (
@@ -15,10 +21,14 @@ from complexbody.forms.icosahedral import (
 from complexbody.forms.two_field import isotropic_two_field
 
 __all__ = [
+    "bubbly_branches",
+    "bubbly_dispersion",
+    "bubbly_liquid",
     "decagonal_quasicrystal",
     "hexagonal_quasicrystal",
     "icosahedral_quasicrystal",
     "isotropic_two_field",
+    "minnaert",
     "phason_moduli",
     "scaled_icosahedral_quasicrystal",
 ]
