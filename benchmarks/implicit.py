@@ -31,9 +31,7 @@ def scene(comm: Any, cells: int) -> cb.Scene:
         gradient = sum(N[0, j] ** 2 for j in range(3))
         return 0.5 * (squares + gradient) + 0.4 * (U[0, 0] + U[1, 1]) * nu[0] + nu[0] ** 2
 
-    body = cb.Body(
-        1, energy, 1.0, lambda nu, v: 0.5 * (1 + nu[0]) ** 3 * v[0] ** 2, displacement=2
-    )
+    body = cb.Body(1, energy, 1.0, lambda nu, v: 0.5 * (1 + nu[0]) ** 3 * v[0] ** 2, displacement=2)
     mesh = dmesh.create_unit_square(comm, cells, cells, ghost_mode=dmesh.GhostMode.none)
     start = lambda x: 0.3 * np.cos(np.pi * x[0]) * np.cos(np.pi * x[1])  # noqa: E731
     return cb.Scene(mesh, body, supports=[cb.Fix("u", "boundary")], initial=cb.Initial(nu=start))

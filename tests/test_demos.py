@@ -14,6 +14,7 @@ DEMOS = Path(__file__).parents[1] / "demos"
 SMALL = [
     ("standing_wave.py", ("--set", "cells=32"), "error"),
     ("standing_wave.py", ("--set", "cells=32", "--set", "dim=1"), "error"),
+    ("bubbly_shock.py", ("--set", "cells=550"), "phase speeds"),
     (
         "impact.py",
         ("--set", "refine=0.5", "--until", "2.4e-6", "--every", "1.2e-6"),

@@ -249,13 +249,12 @@ class ImplicitRun(ForceRun):
 
     def summary(self) -> str:
         """What solving took, and γ, Ξ and T₀ over the states seen, in words; collective."""
-        count = self.problem.comm.allgather(self.count)
-        nodes = self.problem.disc.nodes if isinstance(self.solver, NodalNewton) else 1
-        steps = max(int(self.count[2]), 1)
-        text = (
-            f"{self.count[0] / nodes / steps:.2f} Newton iterations per step, at most "
-            f"{max(int(c[1]) for c in count)}"
-        )
+        nodal, comm = isinstance(self.solver, NodalNewton), self.problem.comm
+        # SNES counts the same on every rank; nodes are counted where they are.
+        nodes = comm.allreduce(self.problem.disc.nodes) if nodal else comm.size
+        total, most = comm.allreduce(int(self.count[0])), max(comm.allgather(int(self.count[1])))
+        mean = total / nodes / max(int(self.count[2]), 1)
+        text = f"{mean:.2f} Newton iterations per step, at most {most}"
         if self.linear:
             text += f"; {self.linear / max(int(self.count[0]), 1):.1f} linear ones per Newton"
         r, order = self.range, self.method.order

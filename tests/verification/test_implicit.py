@@ -11,9 +11,12 @@ import scipy.sparse.linalg as spla
 import ufl
 from harness import largest, refused
 from mpi4py import MPI
+from verification.bubbles import Bubble, collapse_time
 
 import complexbody as cb
 from complexbody.errors import BodyError, IntegratorError, SolverError, StepError
+from complexbody.forms import bubbly_liquid
+from complexbody.forms.bubbly import number_density
 
 QUADRATURES = ("vertex", "consistent")
 
@@ -313,3 +316,44 @@ def test_refusals(comm):
     for name in ("step", "tolerance", "safety"):
         with refused(StepError, name):
             cb.Implicit(**{name: 0.0})
+
+
+def bubble(comm, stretch):
+    """Bubbles in liquid that is held, released from rest at R = stretch R0, and one alone."""
+    body = bubbly_liquid(void_fraction=1e-6, sound_speed=150.0, d=1)
+    scene = cb.Scene(
+        line(comm, 2), body, supports=[cb.Fix("u", "boundary"), cb.Fix("u", lambda x: x[0] < 2)],
+        initial=cb.Initial(nu=1e-3 * (stretch - 1)),
+    )  # fmt: skip
+    c, n = body.constants, number_density(1e-3, 1e-6)
+    S = 4 * np.pi * n * 1e-6 * c["density"] * c["sound_speed"] ** 2
+    return scene, Bubble(1e-3, c["density"], c["pressure"], c["gamma"], S=S)
+
+
+@pytest.mark.filterwarnings("ignore:The energy of bubbly liquid does not see")
+def test_rayleigh_plesset(comm):
+    """Free oscillation from 1.6 R0 down to half of it: radius in the period's course, order 2."""
+    _, reference = bubble(comm, 1.6)
+    until = 0.8 * reference.period(1.6e-3)
+    exact = reference.trajectory(1.6e-3, [0.0, until])[0, -1] - 1e-3
+    found = []
+    for n in (200, 400):
+        scene, _ = bubble(comm, 1.6)
+        result = cb.simulate(scene, cb.Implicit(until / n), until=until)
+        found.append(largest(comm, result.nu.x.array - exact))
+    assert 1.9 < np.log2(found[0] / found[1]) < 2.1, found
+    assert found[1] < 1e-7
+
+
+@pytest.mark.filterwarnings("ignore:The energy of bubbly liquid does not see")
+def test_rayleigh_collapse(comm):
+    """A bubble of 8 R0 falls in about Rayleigh's time; large steps are refused at its bottom."""
+    scene, reference = bubble(comm, 8.0)
+    fall = reference.period(8e-3) / 2
+    assert abs(fall / collapse_time(8e-3, 1000.0, 101325.0) - 1) < 0.1
+    step = fall / 4000
+    result = cb.simulate(scene, cb.Implicit(step), until=0.98 * fall)
+    exact = reference.trajectory(8e-3, [0.0, 0.98 * fall])[0, -1]
+    assert largest(comm, (result.nu.x.array + 1e-3) / exact - 1) < 1e-3
+    with refused(SolverError, "t = ", "ν"):
+        cb.simulate(bubble(comm, 8.0)[0], cb.Implicit(fall / 100), until=1.2 * fall, growth=None)
