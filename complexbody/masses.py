@@ -117,6 +117,9 @@ class Masses:
     Args:
         disc: The scene's arrays.
         fixed: Prescribed components, shape (nodes, n).
+        stiffness: S per body (bodies, k, k): Ω + h²S/4 is then the inertia
+            (:mod:`complexbody.stiffness`).
+        step: That h [s].
 
     Attributes:
         classes: Class of each node, shape (nodes + 1,), int32.
@@ -129,10 +132,18 @@ class Masses:
         BodyError: if a body's inertia is a function (explicit integrators cannot take it).
     """
 
-    def __init__(self, disc: Discretisation, fixed: npt.NDArray[np.bool_]) -> None:
+    def __init__(
+        self,
+        disc: Discretisation,
+        fixed: npt.NDArray[np.bool_],
+        stiffness: Array | None = None,
+        step: float = 0.0,
+    ) -> None:
         bodies = disc.scene.bodies
         self.n, self.n_u = disc.n, disc.scene.displacement
         omega = np.array([body.inertia_matrix for body in bodies])
+        if stiffness is not None:
+            omega = omega + 0.25 * step**2 * stiffness
         eta = np.array([body.viscosity_matrix for body in bodies])
         rho = disc.density()
         # A node of one region has that region's matrices to the bit; others their own averages.

@@ -25,6 +25,7 @@ from complexbody.errors import agree
 from complexbody.kernels.library import Kernels
 from complexbody.masses import Masses
 from complexbody.scene import FIELDS, Scene
+from complexbody.stiffness import self_stiffness
 
 Array = npt.NDArray[np.float64]
 
@@ -35,6 +36,7 @@ class Problem:
     Attributes:
         scene, action, disc, kernels, masses: The layers below.
         supports, loads: In geometry nodes.
+        self_stiffness: S per body of an implicit self-action (bodies, k, k); else zero.
         moving: (node, component) of supports that move, sorted by node; own numbering.
         load_position, load_group, load_value: Entries of load vectors in flat node records.
         inertias: The bodies as the user gave them: of those with a general χ(ν, ν̇), ``scene`` has
@@ -106,6 +108,12 @@ class Problem:
         disc = self.disc
         self.kernels = Kernels(self.action, disc)
         fixed = self.supports.fixed[disc.dof]
+        bodies, k = len(scene.bodies), scene.descriptor
+        self.self_stiffness = (
+            self_stiffness(scene, self.kernels.densities)
+            if scene.self_action == "implicit"
+            else np.zeros((bodies, k, k))
+        )
         self.masses = Masses(disc, fixed)
         # Whatever integrator follows, kinetic energies are those of the whole Ω.
         self.kernels.select(self.masses.diagonal, damped=False)
@@ -115,6 +123,12 @@ class Problem:
         self.load_position = number[self.loads.node] * disc.record + self.loads.component
         self.load_group, self.load_value = self.loads.group, self.loads.value
         self._initial(*self._start, fixed)
+
+    def stiffen(self, step: float) -> None:
+        """Give nodes the inertia Ω + h²S/4 of an implicit self-action, for the step h."""
+        if np.any(self.self_stiffness):
+            fixed = self.supports.fixed[self.disc.dof]
+            self.masses = Masses(self.disc, fixed, self.self_stiffness, step)
 
     def _initial(self, fields: Array, rates: Array, fixed: Any) -> None:
         disc, sup = self.disc, self.supports

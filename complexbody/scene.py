@@ -119,7 +119,8 @@ class Scene:
         cell_tags: dolfinx MeshTags of cells, needed where bodies or loads name cell tags.
         facet_tags: dolfinx MeshTags of facets, needed where supports or loads name facet tags.
         self_action: "consistent" integrates the quadratic self-action of P1 fields exactly,
-            "lumped" by the vertex rule.
+            "lumped" by the vertex rule; "implicit" lumps it and steps over it where it is faster
+            than waves across a cell (:mod:`complexbody.stiffness`; Synchronous only).
         name: What to call it in tables and files.
 
     Raises:
@@ -148,9 +149,10 @@ class Scene:
         self._check_tags()
         if not isinstance(self.initial, Initial):
             raise SceneError("Scene: initial is not an Initial. Give initial=cb.Initial(u=…).")
-        if self.self_action not in ("consistent", "lumped"):
+        if self.self_action not in ("consistent", "lumped", "implicit"):
             raise SceneError(
-                f"Scene: self_action is {self.self_action!r}. Give 'consistent' or 'lumped'."
+                f"Scene: self_action is {self.self_action!r}. Give 'consistent', 'lumped' or "
+                "'implicit'."
             )
 
     @property
@@ -159,6 +161,11 @@ class Scene:
         if isinstance(self.body, Body):
             return (self.body,)
         return tuple(self.body[tag] for tag in sorted(self.body))
+
+    @property
+    def lumped(self) -> bool:
+        """Whether the self-action is lumped at the vertices."""
+        return self.self_action != "consistent"
 
     @property
     def displacement(self) -> int:

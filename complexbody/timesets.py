@@ -19,7 +19,7 @@ from complexbody import _compat, native
 from complexbody.errors import IntegratorError, StepError
 from complexbody.kernels.ffcx import Tabulated
 from complexbody.kernels.pencil import matrix_eigenvalues, quadratic_eigenvalues
-from complexbody.masses import effective, pencil_basis
+from complexbody.masses import Masses, effective, pencil_basis
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
@@ -50,7 +50,9 @@ class _Region:
         self.rho = rho
         body = scene.bodies[number]
         self.basis, self.m, self.d = pencil_basis(body.inertia_matrix, body.viscosity_matrix)
-        self.lumped = scene.self_action == "lumped"
+        self.lumped = scene.lumped
+        S = problem.self_stiffness[number]
+        self.s = np.einsum("ji,jk,ki->i", self.basis, S, self.basis)
         blocks = disc.region == number
         self.geometry = np.ascontiguousarray(disc.geometry[blocks])
         identity = np.count_nonzero(self.basis - np.diag(np.diag(self.basis))) == 0
@@ -123,7 +125,8 @@ class _Region:
         """λ_max of M̂_K(h)⁻¹K_K for steps h of shape (blocks, W); zero for padding."""
         mu = np.empty((*h.shape, self.n))
         mu[..., : self.n_u] = self.rho[..., None]
-        mu[..., self.n_u :] = effective(self.m, self.d, h[..., None], scheme)
+        m = self.m + 0.25 * h[..., None] ** 2 * self.s
+        mu[..., self.n_u :] = effective(m, self.d, h[..., None], scheme)
         scale = np.ascontiguousarray((1.0 / np.sqrt(mu)).transpose(0, 2, 1))
         if self.matrices is None:
             values = quadratic_eigenvalues(
@@ -140,7 +143,7 @@ class _Region:
     def steps(self, scheme: str) -> Array:
         """Largest h per cell with h²λ_K(h) ≤ 4, shape (blocks, W); inf where nothing limits it."""
         h = np.ones(self.geometry.shape[::2])
-        if not np.any(self.d) or scheme == "symmetric":
+        if not np.any(self.s) and (not np.any(self.d) or scheme == "symmetric"):
             with np.errstate(divide="ignore"):
                 return 2.0 / np.sqrt(np.maximum(self.eigenvalues(h, scheme), 0.0))
         # h² λ(h) grows like a power of h between 1 and 2; bracket it from below in log scale.
@@ -232,14 +235,18 @@ def _shared_mass(problem: Problem, h: float, scheme: str) -> float:
     """Smallest ratio r of an effective nodal mass to the sum of its bodies' shares, at most 1."""
     masses, disc = problem.masses, problem.disc
     parts = []
-    for body in problem.scene.bodies:
+    for r, body in enumerate(problem.scene.bodies):
         basis, m, d = pencil_basis(body.inertia_matrix, body.viscosity_matrix)
+        S = problem.self_stiffness[r]
+        m = m + 0.25 * h * h * np.einsum("ji,jk,ki->i", basis, S, basis)
         back = np.linalg.inv(basis)
         parts.append(back.T @ np.diag(effective(m, d, h, scheme)) @ back)
     mixed = np.flatnonzero(~masses.pure)
     node = np.unique(masses.classes[:-1], return_index=True)[1][mixed]
     weight = disc.region_volume[node] / disc.volume[node, None]
     total = np.einsum("cr,rij->cij", weight, np.array(parts))
+    if np.any(problem.self_stiffness):
+        masses = Masses(disc, masses.fixed[masses.classes[:-1]], problem.self_stiffness, h)
     whole = masses.effective(h, scheme)[mixed, masses.n_u :, masses.n_u :]
     ratios = np.linalg.eigvals(np.linalg.solve(total, whole)).real
     return float(problem.comm.allreduce(float(ratios.min(initial=1.0)), op=MPI.MIN))

@@ -19,12 +19,14 @@ from complexbody.forms.icosahedral import (
     scaled_icosahedral_quasicrystal,
 )
 from complexbody.forms.two_field import isotropic_two_field
+from complexbody.forms.voids import elastic_voids
 
 __all__ = [
     "bubbly_branches",
     "bubbly_dispersion",
     "bubbly_liquid",
     "decagonal_quasicrystal",
+    "elastic_voids",
     "hexagonal_quasicrystal",
     "icosahedral_quasicrystal",
     "isotropic_two_field",

@@ -23,6 +23,7 @@ from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions, graded, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
+from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import cell_steps, require_constant_inertia
 
 Array = npt.NDArray[np.float64]
@@ -144,6 +145,7 @@ class AVI:
             StepError: for ``steps`` that are not one per cell, positive, and stable.
         """
         require_constant_inertia(problem, "AVI")
+        require_explicit_self_action(problem.scene, "AVI")
         critical = cell_steps(problem, self.dissipation)
         disc = problem.disc
         real = disc.source_cell >= 0

@@ -19,6 +19,7 @@ from complexbody.integrators.implicit_run import ImplicitRun
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
 from complexbody.problem import Problem
+from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import critical_step
 
 
@@ -98,6 +99,7 @@ class Implicit:
         if not general and self.solve == "needed" and self.quadrature == "vertex":
             same = Synchronous(self.step, self.safety, scheme, start, unstable_ok=self.unstable_ok)
             return same.prepare(problem, until)
+        require_explicit_self_action(problem.scene, "solving for momenta")
         if np.any(np.linalg.eigvalsh(problem.masses.inertia) <= 0):
             raise IntegratorError(
                 "Implicit solves for momenta, which a descriptor without inertia does not have. "

@@ -49,6 +49,7 @@ from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
 from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.problem import Problem
+from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import require_constant_inertia
 
 Array = npt.NDArray[np.float64]
@@ -118,6 +119,7 @@ class LocalLeapfrog:
             IntegratorError: if the body does not fit, or not the dissipation scheme.
         """
         require_constant_inertia(problem, "LocalLeapfrog")
+        require_explicit_self_action(problem.scene, "LocalLeapfrog")
         if self.levels != 0:
             for body in problem.scene.bodies:
                 _require_semilinear(problem, body)

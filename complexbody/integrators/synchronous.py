@@ -16,6 +16,7 @@ from complexbody.errors import IntegratorError, StepError
 from complexbody.integrators.synchronous_run import SynchronousRun
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
+from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import critical_step, require_constant_inertia
 
 
@@ -80,6 +81,8 @@ class Synchronous:
             IntegratorError: if the body does not fit the dissipation scheme.
         """
         require_constant_inertia(problem, "Synchronous")
+        if self.critical == "global":
+            require_explicit_self_action(problem.scene, "critical='global'")
         critical = critical_step(problem, self.dissipation, self.critical)
         step = self.step
         if step is None:
@@ -90,4 +93,5 @@ class Synchronous:
                 f"The step {step:.6g} s is larger than the critical step {critical:.6g} s, so the "
                 "run would be unstable. Give a smaller step, or unstable_ok=True to see it happen."
             )
+        problem.stiffen(float(step))
         return SynchronousRun(problem, self, float(step), float(critical))

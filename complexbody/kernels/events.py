@@ -22,7 +22,7 @@ CHUNK = 8
 def regions(kernels: Kernels) -> list[EventSource | None]:
     """Source generators of the regions with generated code; None for the others."""
     d, disc, scene = kernels.densities, kernels.disc, kernels.action.scene
-    lumped = scene.self_action == "lumped"
+    lumped = scene.lumped
     out: list[EventSource | None] = []
     for r, generated in enumerate(d.generated):
         stored = d.stored[r]

@@ -103,9 +103,9 @@ class Kernels:
     def __init__(self, action: Action, disc: Discretisation) -> None:
         self.action, self.disc = action, disc
         self.densities = Densities(action)
-        if action.scene.self_action == "lumped" and not all(self.densities.generated):
+        if action.scene.lumped and not all(self.densities.generated):
             raise SceneError(
-                "self_action='lumped' needs quadratic energies with coefficients constant on each "
+                f"self_action='{action.scene.self_action}' needs quadratic energies with coefficients constant on each "
                 "cell, and one of these is not. Use self_action='consistent'."
             )
         n, record = disc.n, disc.record
@@ -164,7 +164,7 @@ class Kernels:
             if generated:
                 stored = d.stored[r]
                 assert stored is not None
-                lumped = scene.self_action == "lumped"
+                lumped = scene.lumped
                 region = RegionSource(
                     r, stored, d.potential[r], disc.n, disc.dim, lumped, d.coefficients
                 )
