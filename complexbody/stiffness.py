@@ -7,8 +7,8 @@ total force at x_n,
 
 .. math:: (M + \tfrac{h^2}{4}S)\,\delta^2x_n = -h^2Kx_n,
 
-stable iff 4M + h²S − h²K ≻ 0: S drops out of K. What stays is the coupling of ν to gradients (b ν tr ε
-of voids), which with a tiny inertia would limit the step to a fraction of the gradients' own. For
+stable iff 4M + h²S − h²K ≻ 0: S drops out of K. What stays is the coupling of ν to gradients, bν tr ε
+of voids, which with a tiny inertia would limit the step to a fraction of the gradients' own. For
 coercive energies K ⪯ (1+δ)K_∇ + (1+1/δ)S (Young), so (1+1/δ)S in the place of S leaves the gradient
 step but for a factor 1/√(1+δ): δ = 0.21 costs a tenth. Slow motions see an error of (1+1/δ)(ωh)²/4.
 """
@@ -33,8 +33,8 @@ DELTA = 0.21
 def self_stiffness(scene: Scene, densities: Any) -> Array:
     """S per body, shape (bodies, k, k), such that the inertia Ω + h²S/4 takes the self-action in.
 
-    It dominates ∂²(ρe + ρw)/∂ν∂ν (times 1 + 1/δ where that couples to anything else), and is diagonal
-    in the basis in which inertia and viscosity are: in that basis, a sum of magnitudes by row.
+    It dominates ∂²(ρe + ρw)/∂ν∂ν (times 1 + 1/δ where ν couples to anything else), and is diagonal
+    in the basis in which inertia and viscosity are: there, a sum of magnitudes by row.
 
     Raises:
         IntegratorError: where the self-action varies within a body.

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-r"""Elastic material with voids: displacement u, descriptor ν the change of the solid volume fraction.
+r"""Elastic material with voids: displacement u, descriptor ν the change of the volume fraction.
 
 .. math:: \rho e = \tfrac12\lambda(\mathrm{tr}\,\varepsilon)^2 + \mu|\varepsilon|^2
           + \tfrac12\alpha|\nabla\nu|^2 + \tfrac12\xi\nu^2 + b\nu\,\mathrm{tr}\,\varepsilon,
           \qquad \chi = \tfrac12\bar\rho\dot\nu^2.
 
-Coercive iff μ, α, ξ > 0 and (λ + 2μ/3)ξ > b². The void's own frequency √(ξ/ρ̄) does not depend on the
-mesh: with the constants of magnesium it is 6.95e10 rad/s, thousands of times what waves across a
-millimetre need; a scene with ``self_action="implicit"`` steps over it. Sources (constants recalled,
-not re-read: (r)): Nunziato and Cowin 1979; Cowin and Nunziato 1983.
+Coercive iff μ, α, ξ > 0 and (λ + 2μ/3)ξ > b². The void's own frequency √(ξ/ρ̄) does not depend on
+the mesh: with the constants of magnesium it is 6.95e10 rad/s, thousands of times what waves across
+a millimetre need; a scene with ``self_action="implicit"`` steps over it. Sources (constants
+recalled, not re-read: (r)): Nunziato and Cowin 1979; Cowin and Nunziato 1983.
 """
 
 from __future__ import annotations

@@ -105,8 +105,9 @@ class Kernels:
         self.densities = Densities(action)
         if action.scene.lumped and not all(self.densities.generated):
             raise SceneError(
-                f"self_action='{action.scene.self_action}' needs quadratic energies with coefficients constant on each "
-                "cell, and one of these is not. Use self_action='consistent'."
+                f"self_action={action.scene.self_action!r} needs quadratic energies with "
+                "coefficients constant on each cell, and one of these is not. Use "
+                "self_action='consistent'."
             )
         n, record = disc.n, disc.record
         shape = (disc.nodes + 1, record)
