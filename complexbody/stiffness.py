@@ -7,10 +7,11 @@ total force at x_n,
 
 .. math:: (M + \tfrac{h^2}{4}S)\,\delta^2x_n = -h^2Kx_n,
 
-stable iff 4M + h²S − h²K ≻ 0: S drops out of K. What stays is the coupling of ν to gradients, bν tr ε
-of voids, which with a tiny inertia would limit the step to a fraction of the gradients' own. For
-coercive energies K ⪯ (1+δ)K_∇ + (1+1/δ)S (Young), so (1+1/δ)S in the place of S leaves the gradient
-step but for a factor 1/√(1+δ): δ = 0.21 costs a tenth. Slow motions see an error of (1+1/δ)(ωh)²/4.
+stable iff 4M + h²S − h²K ≻ 0: S drops out of K. What stays is the coupling of ν to gradients
+(bν tr ε of voids), which with a tiny inertia would limit the step to a fraction of the gradients'
+own. For coercive energies K ⪯ (1+δ)K_∇ + (1+1/δ)S (Young), so (1+1/δ)S in the place of S leaves the
+gradient step but for a factor 1/√(1+δ): δ = 0.21 costs a tenth. Slow motions see an error of
+(1+1/δ)(ωh)²/4.
 """
 
 from __future__ import annotations
