@@ -31,10 +31,10 @@ def rows(function):
     return values, np.asarray(mesh.geometry.input_global_indices)
 
 
-def run(comm, case, folder, dim=3):
+def run(comm, case, folder, dim=3, scene=None):
     """Results at an end between two steps, with ledger, probes and outputs on the way."""
     kind, scheme, quartic = CASES[case]
-    scene = busy(comm, dim, kind, quartic)
+    scene = scene or busy(comm, dim, kind, quartic)
     probes = {"inside": (0.41, 0.37, 0.33)[:dim], "corner": (1.0, 0.8, 0.7)[:dim]}
     until = 45.3 * critical_step(Problem(scene), scheme)
     output = cb.Output(folder, every=until / 7, probes=probes, probe_steps=3)
@@ -77,7 +77,12 @@ def test_one_rank_or_more(comm, shared_path, tmp_path, case, dim):
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_same_bits_again(comm, shared_path, case):
-    first, second = (run(comm, case, shared_path / name) for name in ("first", "second"))
+    # One mesh for both: dolfinx's partitioner may cut the same input differently the next time.
+    kind, _, quartic = CASES[case]
+    scene = busy(comm, 3, kind, quartic)
+    first, second = (
+        run(comm, case, shared_path / name, scene=scene) for name in ("first", "second")
+    )
     for name in FIELDS:
         same = np.array_equal(getattr(first, name).x.array, getattr(second, name).x.array)
         assert everywhere(comm, same), name
