@@ -119,7 +119,7 @@ class Masses:
         fixed: Prescribed components, shape (nodes, n).
         stiffness: S per body (bodies, k, k): Ω + h²S/4 is then the inertia
             (:mod:`complexbody.stiffness`).
-        step: That h [s].
+        step: That h [s], for all nodes or of each (nodes,).
 
     Attributes:
         classes: Class of each node, shape (nodes + 1,), int32.
@@ -137,13 +137,13 @@ class Masses:
         disc: Discretisation,
         fixed: npt.NDArray[np.bool_],
         stiffness: Array | None = None,
-        step: float = 0.0,
+        step: float | Array = 0.0,
     ) -> None:
         bodies = disc.scene.bodies
         self.n, self.n_u = disc.n, disc.scene.displacement
         omega = np.array([body.inertia_matrix for body in bodies])
-        if stiffness is not None:
-            omega = omega + 0.25 * step**2 * stiffness
+        extra = np.zeros_like(omega) if stiffness is None else 0.25 * stiffness
+        h = np.broadcast_to(np.asarray(step, dtype=np.float64), (disc.nodes,)) + 0.0
         eta = np.array([body.viscosity_matrix for body in bodies])
         rho = disc.density()
         # A node of one region has that region's matrices to the bit; others their own averages.
@@ -153,7 +153,7 @@ class Masses:
         label = region.astype(np.int64)
         label[mixed] = len(bodies) + np.arange(len(mixed))
         bits = fixed @ (1 << np.arange(self.n, dtype=np.int64))
-        keys = np.stack([label, bits, rho.view(np.int64)], axis=1)
+        keys = np.stack([label, bits, rho.view(np.int64), h.view(np.int64)], axis=1)
         _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         self.classes = np.zeros(disc.nodes + 1, np.int32)
         self.classes[:-1] = inverse.ravel()
@@ -163,10 +163,11 @@ class Masses:
         rows = np.flatnonzero(region[first] >= 0)
         weight[rows, region[first][rows]] = 1.0
         self.inertia = np.einsum("cr,rij->cij", weight, omega)
+        self.inertia += np.einsum("c,cr,rij->cij", h[first] ** 2, weight, extra)
         self.viscosity = np.einsum("cr,rij->cij", weight, eta)
         self.damped = bool(np.any(eta))
         off = ~np.eye(disc.scene.descriptor, dtype=bool)
-        self.diagonal = not (np.any(omega[:, off]) or np.any(eta[:, off]))
+        self.diagonal = not (np.any((omega + extra)[:, off]) or np.any(eta[:, off]))
         self.pure = region[first] >= 0
         self._bases = [
             pencil_basis(o, e) for o, e in zip(self.inertia, self.viscosity, strict=True)

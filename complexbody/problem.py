@@ -37,6 +37,7 @@ class Problem:
         scene, action, disc, kernels, masses: The layers below.
         supports, loads: In geometry nodes.
         self_stiffness: S per body of an implicit self-action (bodies, k, k); else zero.
+        node_step: h of its inertia Ω + h²S/4 [s], of all nodes or each (dolfinx's numbers).
         moving: (node, component) of supports that move, sorted by node; own numbering.
         load_position, load_group, load_value: Entries of load vectors in flat node records.
         inertias: The bodies as the user gave them: of those with a general χ(ν, ν̇), ``scene`` has
@@ -61,6 +62,7 @@ class Problem:
         self.loads = boundary.loads(scene, self.action)
         self._start = boundary.initial(scene, self.action)
         self._read_inertia()
+        self.node_step: float | Array = 0.0
         self.arrange()
         self.warnings = self._check_energy()
 
@@ -114,7 +116,7 @@ class Problem:
             if scene.self_action == "implicit"
             else np.zeros((bodies, k, k))
         )
-        self.masses = Masses(disc, fixed)
+        self.masses = self._stiffened()
         # Whatever integrator follows, kinetic energies are those of the whole Ω.
         self.kernels.select(self.masses.diagonal, damped=False)
         rows, columns = np.nonzero(moving[disc.dof])
@@ -124,11 +126,22 @@ class Problem:
         self.load_group, self.load_value = self.loads.group, self.loads.value
         self._initial(*self._start, fixed)
 
-    def stiffen(self, step: float) -> None:
-        """Give nodes the inertia Ω + h²S/4 of an implicit self-action, for the step h."""
+    def stiffen(self, step: float | Array) -> None:
+        """Give nodes the inertia Ω + h²S/4 of an implicit self-action; kept by ``arrange``.
+
+        Args:
+            step: h [s], for all nodes, or of each node of this rank in dolfinx's numbering.
+        """
         if np.any(self.self_stiffness):
-            fixed = self.supports.fixed[self.disc.dof]
-            self.masses = Masses(self.disc, fixed, self.self_stiffness, step)
+            self.node_step = step
+            self.masses = self._stiffened()
+
+    def _stiffened(self) -> Masses:
+        step = self.node_step
+        if isinstance(step, np.ndarray):
+            step = step[self.disc.dof]
+        fixed = self.supports.fixed[self.disc.dof]
+        return Masses(self.disc, fixed, self.self_stiffness, step)
 
     def _initial(self, fields: Array, rates: Array, fixed: Any) -> None:
         disc, sup = self.disc, self.supports

@@ -120,7 +120,7 @@ class Scene:
         facet_tags: dolfinx MeshTags of facets, needed where supports or loads name facet tags.
         self_action: "consistent" integrates the quadratic self-action of P1 fields exactly,
             "lumped" by the vertex rule; "implicit" lumps it and steps over it where it is faster
-            than waves across a cell (:mod:`complexbody.stiffness`; Synchronous only).
+            than waves across a cell (:mod:`complexbody.stiffness`).
         name: What to call it in tables and files.
 
     Raises:

@@ -11,7 +11,8 @@ stable iff 4M + h²S − h²K ≻ 0: S drops out of K. What stays is the couplin
 (bν tr ε of voids), which with a tiny inertia would limit the step to a fraction of the gradients'
 own. For coercive energies K ⪯ (1+δ)K_∇ + (1+1/δ)S (Young), so (1+1/δ)S in the place of S leaves the
 gradient step but for a factor 1/√(1+δ): δ = 0.21 costs a tenth. Slow motions see an error of
-(1+1/δ)(ωh)²/4.
+(1+1/δ)(ωh)²/4. Where cells have their own steps each node has its own h
+(:mod:`complexbody.integrators.stiffened`).
 """
 
 from __future__ import annotations
@@ -67,10 +68,10 @@ def require_explicit_self_action(scene: Scene, integrator: str) -> None:
     """Refuse ``self_action="implicit"`` for an integrator that cannot take it.
 
     Raises:
-        IntegratorError: naming the integrator that can.
+        IntegratorError: naming integrators that can.
     """
     if scene.self_action == "implicit":
         raise IntegratorError(
-            f"self_action='implicit' is for Synchronous, not {integrator}. Use Synchronous(), or "
-            "self_action='lumped' in the scene."
+            f"self_action='implicit' is not for {integrator}. Use Synchronous(), AVI() or "
+            "LocalLeapfrog(), or self_action='lumped' in the scene."
         )

@@ -19,16 +19,18 @@ import numpy.typing as npt
 from complexbody.errors import IntegratorError, StepError, agree
 from complexbody.integrators.exact_run import ExactRun
 from complexbody.integrators.exact_schedule import span_length
+from complexbody.integrators.stiffened import reach, stiffen
 from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions, graded, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
-from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import cell_steps, require_constant_inertia
 
 Array = npt.NDArray[np.float64]
 SCHEDULES = ("windows", "exact", "octaves")
 STARTS = ("trapezoidal", "one-sided")
+#: α, below the resonances of two-rate bars, which begin at 0.47 of the critical step.
+SAFETY = 0.45
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ class AVI:
         IntegratorError, StepError: for options that make no sense, or not together.
     """
 
-    safety: float = 0.45
+    safety: float = SAFETY
     schedule: str | None = None
     balanced: bool | None = None
     dissipation: str = "exact"
@@ -121,7 +123,7 @@ class AVI:
                 raise IntegratorError(f"AVI: {advice}.")
 
     @classmethod
-    def as_published(cls, safety: float = 0.45, steps: Array | None = None) -> AVI:
+    def as_published(cls, safety: float = SAFETY, steps: Array | None = None) -> AVI:
         """The paper's scheme: real steps, one-sided start, (dissdiscr) with its sign corrected."""
         return cls(
             safety, "exact", dissipation="forward", start="one-sided", corrected=False, steps=steps
@@ -131,6 +133,11 @@ class AVI:
     def order(self) -> int:
         """Order of convergence in the steps."""
         return 1 if self.dissipation == "forward" or self.start == "one-sided" else 2
+
+    @property
+    def fraction(self) -> float:
+        """Of the critical step, to which an implicit self-action grows a node's inertia."""
+        return max(self.safety, SAFETY)
 
     @property
     def symplectic(self) -> bool:
@@ -145,7 +152,6 @@ class AVI:
             StepError: for ``steps`` that are not one per cell, positive, and stable.
         """
         require_constant_inertia(problem, "AVI")
-        require_explicit_self_action(problem.scene, "AVI")
         critical = cell_steps(problem, self.dissipation)
         disc = problem.disc
         real = disc.source_cell >= 0
@@ -155,6 +161,7 @@ class AVI:
         if self.steps is not None:
             steps = self._given(problem, own)
         window = window_length(steps, until, problem.comm)
+        stiffen(problem, reach(np.where(np.isfinite(own), own, window / SAFETY), steps, SAFETY))
         if self.schedule == "exact":
             # A cell without stiffness of its own acts once per span.
             blocks = np.full(critical.shape, np.inf)

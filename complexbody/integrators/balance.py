@@ -58,10 +58,14 @@ def blending(rates: Array, coupled: Array, step: float) -> Array:
     return np.minimum(np.maximum(z, (coupled * felt).max(axis=1)), 1.0)
 
 
-def component_rates(problem: Problem, number: int) -> Array:
-    """η/ρ̄ of a region's components [1/s]; of several modes the fastest that they are in."""
+def component_rates(problem: Problem, number: int, step: float = 0.0) -> Array:
+    """η/ρ̄ of a region's components [1/s]; of several modes the fastest that they are in.
+
+    With an implicit self-action the inertia is at least Ω + h²S/4, h ``step`` [s].
+    """
     body, n_u = problem.scene.bodies[number], problem.scene.displacement
-    basis, mass, viscosity = pencil_basis(body.inertia_matrix, body.viscosity_matrix)
+    inertia = body.inertia_matrix + 0.25 * step**2 * problem.self_stiffness[number]
+    basis, mass, viscosity = pencil_basis(inertia, body.viscosity_matrix)
     with np.errstate(divide="ignore"):
         rate = np.where(viscosity > 0, viscosity / np.where(mass > 0, mass, 0.0), 0.0)
     part = np.abs(basis) > 1e-12 * np.abs(basis).max()
@@ -126,12 +130,12 @@ class Balance:
         self._load = np.zeros((disc.nodes + 1, disc.record))
         if problem.masses.damped:
             numbers = range(len(problem.scene.bodies))
-            rates = [component_rates(problem, r) for r in numbers]
             coupled = [coupling(problem, r) for r in numbers]
             for i in range(plan.count):
                 group = plan.groups[i]
                 r = group.region
-                self.blend[i, : disc.n] = blending(rates[r], coupled[r], group.step)
+                rates = component_rates(problem, r, group.step / run.method.fraction)
+                self.blend[i, : disc.n] = blending(rates, coupled[r], group.step)
 
     def begin(self, t: float) -> None:
         """Forces half a step behind t, from positions and rates there: those of the first steps."""

@@ -45,14 +45,17 @@ from complexbody.body import Body
 from complexbody.errors import IntegratorError
 from complexbody.integrators import octaves
 from complexbody.integrators.entries import Entries
+from complexbody.integrators.stiffened import reach, stiffen
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
 from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.problem import Problem
-from complexbody.stiffness import require_explicit_self_action
-from complexbody.timesets import require_constant_inertia
+from complexbody.timesets import cell_steps, require_constant_inertia
 
 Array = npt.NDArray[np.float64]
+
+#: α, the fraction of critical steps that is used unless another is given.
+SAFETY = 0.9
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,7 @@ class LocalLeapfrog:
         IntegratorError, StepError: for options that make no sense.
     """
 
-    safety: float = 0.9
+    safety: float = SAFETY
     stabilisation: float = 0.15
     dissipation: str = "exact"
     start: str = "trapezoidal"
@@ -119,14 +122,16 @@ class LocalLeapfrog:
             IntegratorError: if the body does not fit, or not the dissipation scheme.
         """
         require_constant_inertia(problem, "LocalLeapfrog")
-        require_explicit_self_action(problem.scene, "LocalLeapfrog")
         if self.levels != 0:
             for body in problem.scene.bodies:
                 _require_semilinear(problem, body)
         ratio = 2 * np.sqrt(self.gamma)
-        plan = octaves.plan(
-            problem, until, self.dissipation, self.safety, ratio, self.step, self.levels
-        )
+        cells, safety = cell_steps(problem, self.dissipation), self.safety
+        if problem.scene.self_action == "implicit":
+            steps = np.minimum(safety * cells, self.step or np.inf)
+            cells, safety = reach(cells, steps, SAFETY), max(safety, SAFETY)
+        plan = octaves.plan(problem, until, cells, safety, ratio, self.step, self.levels)
+        stiffen(problem, np.minimum(plan.cells, plan.step / SAFETY))
         return LocalLeapfrogRun(problem, self, plan)
 
 

@@ -29,7 +29,6 @@ from complexbody.errors import StepError
 from complexbody.halo import Halo, sharing
 from complexbody.integrators.timetable import per_cell
 from complexbody.problem import Problem
-from complexbody.timesets import cell_steps
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -61,7 +60,7 @@ class Plan:
 def plan(
     problem: Problem,
     until: float,
-    scheme: str,
+    cells: Array,
     safety: float,
     ratio: float,
     step: float | None,
@@ -72,7 +71,7 @@ def plan(
     Args:
         problem: The scene, made ready.
         until: End of the run [s].
-        scheme: Dissipation scheme.
+        cells: Critical steps of cells in blocks (blocks, W) [s].
         safety: Fraction of its critical step that a node may use.
         ratio: r, of the steps of two levels.
         step: Coarse step [s], or None for the one that needs the fewest updates.
@@ -82,7 +81,6 @@ def plan(
         StepError: if the levels do not reach the step, or the body has no stiffness.
     """
     comm, disc = problem.comm, problem.disc
-    cells = cell_steps(problem, scheme)
     alone, beside = (safety * steps for steps in node_steps(problem, cells))
     smallest = float(comm.allreduce(float(cells.min(initial=np.inf)), op=MPI.MIN))
     longest = float(np.max(alone, initial=0.0, where=np.isfinite(alone)))
