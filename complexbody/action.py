@@ -51,16 +51,15 @@ class Action:
         self.dx = ufl.Measure("dx", domain=scene.mesh, **data)
 
     def fields(self, q: Any) -> tuple[Any, Any, Any, Any]:
-        """(u, ν, U, N) of a mixed function: shapes (n_u,), (k,), (n_u, 3), (k, 3)."""
+        """(u, ν, U, N) of a mixed function: shapes (n_u,), (k,), (n_u, 3), (k, 3).
+
+        None for what a reduced scene has no component of.
+        """
         n_u, n, dim = self.scene.displacement, self.scene.components, self.scene.mesh.geometry.dim
-        u, nu = (ufl.as_vector([q[i] for i in r]) for r in (range(n_u), range(n_u, n)))
-        gradient = ufl.grad(q)
-        return (
-            u,
-            nu,
-            _columns(gradient, range(n_u), dim),
-            _columns(gradient, range(n_u, n), dim),
-        )
+        gradient, parts = ufl.grad(q), (range(n_u), range(n_u, n))
+        u, nu = (ufl.as_vector([q[i] for i in r]) if r else None for r in parts)
+        U, N = (_columns(gradient, r, dim) if r else None for r in parts)
+        return u, nu, U, N
 
     def stored_density(self, body: Body, q: Any) -> Any:
         """ρe of the mixed function ``q`` [J/m³]."""

@@ -68,8 +68,9 @@ def read(density: Callable[..., Any], mesh: Any, n_u: int, k: int, values: str) 
         values: Which of the two it is.
     """
     n, dim, domain = n_u + k, mesh.geometry.dim, mesh.ufl_domain()
-    u, nu = ufl.Constant(domain, shape=(n_u,)), ufl.Constant(domain, shape=(k,))
-    U, N = ufl.Constant(domain, shape=(n_u, 3)), ufl.Constant(domain, shape=(k, 3))
+    # A reduced scene may have no component of one of them.
+    u, nu = (ufl.Constant(domain, shape=(m,)) if m else None for m in (n_u, k))
+    U, N = (ufl.Constant(domain, shape=(m, 3)) if m else None for m in (n_u, k))
 
     def unknown(terminal: Any, component: tuple[int, ...]) -> Poly | None:
         if terminal is U or terminal is N:

@@ -72,7 +72,7 @@ class Bookkeeper:
 
     def __init__(self, problem: Problem, run: Run, growth: float | None = 10.0) -> None:
         self.problem, self.run, self.growth = problem, run, growth
-        self.ledger = Ledger(problem.scene.displacement)
+        self.ledger = Ledger(problem.whole.displacement)
         self._start: float | None = None
         self._put = 0.0
         self._reference: float | None = None
@@ -98,7 +98,12 @@ class Bookkeeper:
             identity = (missing - self._reference) / self._size
         row = [run.time, e.kinetic_u, e.kinetic_nu, e.stored, e.potential, e.work, e.support_work]
         row += [e.dissipated, energy - given - self._start, identity]
-        row += [e.variation_u, e.variation_nu, *e.momentum]
+        # Components that were left out have no momentum.
+        n_u = self.problem.scene.displacement
+        record = np.zeros(self.problem.scene.components)
+        record[:n_u] = e.momentum
+        momentum = self.problem.spread(record)[: self.problem.whole.displacement]
+        row += [e.variation_u, e.variation_nu, *momentum]
         self.ledger.rows.append([float(v) for v in row])
         self._guard(e.surplus - self._start if run.steps > 0 else 0.0)
         return self.ledger.rows[-1]

@@ -38,6 +38,8 @@ def pencil_basis(mass: Array, viscosity: Array) -> tuple[Array, Array, Array]:
     Returns:
         (V, m, d): columns of V with VᵀΩV = diag(m) and Vᵀ η V = diag(d), V of shape (k, k).
     """
+    if not len(mass):  # of a scene without ν
+        return mass, np.zeros(0), np.zeros(0)
     a, b = float(np.trace(mass)), float(np.trace(viscosity))
     # Scaled by their traces, M and D add up to a well-scaled definite matrix.
     first = mass / a if a > 0 else np.zeros_like(mass)

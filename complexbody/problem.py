@@ -7,6 +7,7 @@ made here, on all ranks together and before any stepping.
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import warnings
 from dataclasses import replace
@@ -23,7 +24,9 @@ from complexbody.convexity import Convexity, Range
 from complexbody.discretisation import Discretisation
 from complexbody.errors import agree
 from complexbody.kernels.library import Kernels
+from complexbody.live import Live, live
 from complexbody.masses import Masses
+from complexbody.reduction import reduced_data, reduced_scene
 from complexbody.scene import FIELDS, Scene
 from complexbody.stiffness import self_stiffness
 
@@ -33,8 +36,13 @@ Array = npt.NDArray[np.float64]
 class Problem:
     """A scene with everything an explicit integrator needs; collective.
 
+    With ``reduce`` components that stay zero are left out (:mod:`complexbody.live`).
+
     Attributes:
         scene, action, disc, kernels, masses: The layers below.
+        whole, whole_action: The user's scene, with the components that ``scene`` leaves out.
+        live: Which components ``scene`` has, and why.
+        full: The problem of ``whole``, whose critical steps are those of the run, until released.
         supports, loads: In geometry nodes.
         self_stiffness: S per body of an implicit self-action (bodies, k, k); else zero.
         node_step: h of its inertia Ω + h²S/4 [s], of all nodes or each (dolfinx's numbers).
@@ -51,10 +59,11 @@ class Problem:
     """
 
     disc: Discretisation
+    self_stiffness: Array
 
-    def __init__(self, scene: Scene) -> None:
-        self.scene, self.comm = scene, scene.mesh.comm
-        self.action = Action(scene)
+    def __init__(self, scene: Scene, reduce: bool = False) -> None:
+        self.scene, self.whole, self.comm = scene, scene, scene.mesh.comm
+        self.action = self.whole_action = Action(scene)
         dofs = _compat.cell_dofs(self.action.space)
         # All layers below rely on one numbering of nodes and P1 degrees of freedom.
         assert np.array_equal(dofs, _compat.cell_nodes(scene.mesh))
@@ -65,6 +74,42 @@ class Problem:
         self.node_step: float | Array = 0.0
         self.arrange()
         self.warnings = self._check_energy()
+        self.live = Live(tuple(range(scene.components)), {}, scene.components)
+        self.full: Problem = self
+        if reduce:
+            self.live = live(self.scene, self.supports, self.loads, self._start)
+        if not self.live.all:
+            self._reduce()
+
+    def _reduce(self) -> None:
+        """Leave out components that no source reaches."""
+        self.full = full = copy.copy(self)
+        full.full, full.live = full, replace(self.live, components=tuple(range(self.live.total)))
+        del self.disc  # the other one's, from now on
+        self.supports, self.loads, self._start = reduced_data(
+            self.live, self.supports, self.loads, self._start
+        )
+        nu = np.array([i for i in self.live.components if i >= self.whole.displacement], dtype=int)
+        nu -= self.whole.displacement
+        self.self_stiffness = full.self_stiffness[:, nu][:, :, nu]
+        self.scene = reduced_scene(self.whole, self.live)
+        self.action = Action(self.scene)
+        self._read_inertia()
+        self.arrange()
+
+    def release(self) -> None:
+        """Give up what only steps and stiffnesses of all components needed; collective."""
+        if self.full is not self:
+            self.full.close()
+            self.full = self
+
+    def spread(self, values: Array) -> Array:
+        """Values of the scene's components (…, n) among zeros for those left out (…, n_u + k)."""
+        if self.live.all:
+            return values
+        out = np.zeros((*values.shape[:-1], self.live.total))
+        out[..., list(self.live.components)] = values
+        return out
 
     def _read_inertia(self) -> None:
         """Convexity of a general χ at the initial state; its γ stands for it in all layers below.
@@ -110,12 +155,10 @@ class Problem:
         disc = self.disc
         self.kernels = Kernels(self.action, disc)
         fixed = self.supports.fixed[disc.dof]
-        bodies, k = len(scene.bodies), scene.descriptor
-        self.self_stiffness = (
-            self_stiffness(scene, self.kernels.densities)
-            if scene.self_action == "implicit"
-            else np.zeros((bodies, k, k))
-        )
+        if not hasattr(self, "self_stiffness"):
+            self.self_stiffness = np.zeros((len(scene.bodies), scene.descriptor, scene.descriptor))
+            if scene.self_action == "implicit":
+                self.self_stiffness = self_stiffness(scene, self.kernels.densities)
         self.masses = self._stiffened()
         # Whatever integrator follows, kinetic energies are those of the whole Ω.
         self.kernels.select(self.masses.diagonal, damped=False)
@@ -239,15 +282,23 @@ class Problem:
     def functions(self, fields: Array, rates: Array) -> dict[str, fem.Function]:
         """dolfinx Functions u, nu, u_dot, nu_dot from node records; collective."""
         out: dict[str, fem.Function] = {}
-        for values, suffix in ((fields, ""), (rates, "_dot")):
+        for suffix in ("", "_dot"):
             for name in FIELDS:
-                columns = self.scene.components_of(name)
-                function = fem.Function(
-                    _compat.vector_space(self.scene.mesh, len(columns)), name=name + suffix
+                columns = self.whole.components_of(name)
+                out[name + suffix] = fem.Function(
+                    _compat.vector_space(self.whole.mesh, len(columns)), name=name + suffix
                 )
-                self.disc.scatter(np.ascontiguousarray(values[:, columns]), function)
-                out[name + suffix] = function
+        self.fill(out, fields, rates)
         return out
+
+    def fill(self, functions: dict[str, fem.Function], fields: Array, rates: Array) -> None:
+        """Values of node records (at least nodes, n) into Functions of all components."""
+        nodes, n = self.disc.nodes, self.disc.n
+        for values, suffix in ((fields, ""), (rates, "_dot")):
+            record = self.spread(values[:nodes, :n])
+            for name in FIELDS:
+                part = np.ascontiguousarray(record[:, self.whole.components_of(name)])
+                self.disc.scatter(part, functions[name + suffix])
 
     def close(self) -> None:
         """Free communicators and requests."""

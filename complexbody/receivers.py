@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from complexbody.discretisation import Discretisation
 from complexbody.files import CsvWriter
 from complexbody.output import Output
 from complexbody.probes import Probes
-from complexbody.scene import Scene
+from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
 
@@ -25,17 +24,19 @@ class Receivers:
     """Probes of a run; opened, recorded, flushed and closed collectively.
 
     Args:
-        scene: The scene.
+        problem: The scene, made ready, whose node records are probed.
         output: Names the probes and the folder.
-        disc: The arrays whose node records are probed.
 
     Raises:
         SceneError: for points outside the body.
         OutputError: if the tables cannot be written.
     """
 
-    def __init__(self, scene: Scene, output: Output, disc: Discretisation) -> None:
-        self.probes, self.n, self.n_u = Probes(scene, output.probes), disc.n, scene.displacement
+    def __init__(self, problem: Problem, output: Output) -> None:
+        scene, disc, self._problem = problem.whole, problem.disc, problem
+        self.probes, self.n, self.n_u = (
+            Probes(scene, output.probes), scene.components, scene.displacement,
+        )  # fmt: skip
         self.names, self.stride, self.comm = list(output.probes), output.probe_steps, disc.comm
         self._nodes = disc.number[self.probes.cells_nodes]
         self._rows: list[Array] = []
@@ -51,8 +52,9 @@ class Receivers:
 
     def record(self, time: float, positions: Array) -> None:
         """Note the values at ``time`` [s] from node records (nodes, at least n)."""
-        values = positions[self._nodes][..., : self.n]
-        self._rows.append(np.einsum("pa,pan->pn", self.probes.weights, values))
+        values = positions[self._nodes][..., : self._problem.disc.n]
+        found = np.einsum("pa,pan->pn", self.probes.weights, values)
+        self._rows.append(self._problem.spread(found))
         self._times.append(time)
 
     def flush(self) -> None:

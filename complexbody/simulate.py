@@ -42,6 +42,7 @@ def simulate(
     ledger_steps: int | None = None,
     growth: float | None = 10.0,
     progress: bool | None = None,
+    plan: bool = True,
 ) -> Result:
     """Run a scene from t = 0 to ``until``; collective.
 
@@ -55,6 +56,7 @@ def simulate(
             per cent of the run, but at least a hundred rows.
         growth: Stop when energy from nowhere exceeds this multiple of what was put in; None: never.
         progress: Show progress on rank 0; by default where standard error is a terminal.
+        plan: Leave out what changes no result (:mod:`complexbody.plan`); False runs everything.
 
     Returns:
         Fields at the final time, ledger, probes and statistics.
@@ -64,7 +66,7 @@ def simulate(
     """
     return Simulation(
         scene, integrator, until=until, output=output, ledger_steps=ledger_steps, growth=growth,
-        progress=progress,
+        progress=progress, plan=plan,
     ).run()  # fmt: skip
 
 
@@ -89,6 +91,7 @@ class Simulation:
         ledger_steps: int | None = None,
         growth: float | None = 10.0,
         progress: bool | None = None,
+        plan: bool = True,
     ) -> None:
         begun = clock.perf_counter()
         if not (np.isfinite(until) and until > 0):
@@ -99,12 +102,13 @@ class Simulation:
             raise SceneError(f"simulate: ledger_steps is {ledger_steps}. Give 1 or more.")
         self.method = method = integrator or Synchronous()
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
-        self.problem = Problem(scene)
+        self.problem = Problem(scene, reduce=plan)
         self.run_: Run = method.prepare(self.problem, until)
+        self.problem.release()
         self.last = int(np.ceil(until / self.run_.step - 1e-9))
         self.times = output.schedule(until) if output is not None else np.zeros(0)
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
-        self.writer = Writer(self.problem.action, output) if output is not None else None
+        self.writer = Writer(self.problem.whole_action, output) if output is not None else None
         if self.writer is not None:
             self.writer.write_steps(self._steps())
         self.books = Bookkeeper(self.problem, self.run_, growth)
@@ -114,7 +118,7 @@ class Simulation:
         self.csv: CsvWriter | None = None
         if output is not None:
             if output.probes:
-                self.receivers = Receivers(scene, output, self.problem.disc)
+                self.receivers = Receivers(self.problem, output)
             ledger = self.books.ledger
             columns = dict(zip(ledger.columns, ledger.units(), strict=True))
             self.csv = CsvWriter(Path(output.folder) / "ledger.csv", columns, self.comm)
@@ -260,12 +264,7 @@ class Simulation:
     # --- what leaves the run -------------------------------------------------------------------
 
     def _fill(self, x: Array, rates: Array) -> None:
-        nodes = self.problem.disc.nodes
-        for values, suffix in ((x, ""), (rates, "_dot")):
-            for name in ("u", "nu"):
-                columns = self.scene.components_of(name)
-                part = np.ascontiguousarray(values[:nodes, columns])
-                self.problem.disc.scatter(part, self.functions[name + suffix])
+        self.problem.fill(self.functions, x, rates)
 
     def _write(self, t: float, x: Array, rates: Array) -> None:
         begun = clock.perf_counter()

@@ -140,7 +140,7 @@ def _require_semilinear(problem: Problem, body: Body) -> None:
     mesh, n_u, k = problem.scene.mesh, problem.scene.displacement, problem.scene.descriptor
     seen: list[dict[tuple[int, int], Any]] = []
     for scale in (0.37, -1.21):
-        nu = ufl.as_vector([scale * (i + 1) for i in range(k)])
+        nu = ufl.as_vector([scale * (i + 1) for i in range(k)]) if k else None
         frozen = hessian.read(lambda U, _, N, v=nu: body.energy(U, v, N), mesh, n_u, k, "gradients")
         seen.append({} if frozen is None else frozen.hessian)
     if not seen[0] or seen[0] != seen[1]:

@@ -139,15 +139,20 @@ class Kernels:
 
     def select(self, diagonal: bool, damped: bool) -> None:
         """Choose the variant of the node loop: diagonal or block inertia, damping or none."""
-        key = (diagonal, damped)
+        self._variant = (diagonal, damped)
+
+    @property
+    def c(self) -> ctypes.CDLL:
+        """The library of the chosen variant; compiled when first asked for."""
+        key = self._variant
         if key not in self._libraries:
-            library = native.load(self.source(diagonal, damped))
+            library = native.load(self.source(*key))
             library.cb_power.restype = ctypes.c_double
             library.cb_quadratic.restype = ctypes.c_double
             library.cb_move.restype = ctypes.c_double
             library.cb_force_before.restype = ctypes.c_double
             self._libraries[key] = library
-        self.c = self._libraries[key]
+        return self._libraries[key]
 
     def source(self, diagonal: bool, damped: bool) -> str:
         """C source of the scene's library."""
