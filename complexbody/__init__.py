@@ -15,6 +15,7 @@ from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
+from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
@@ -32,12 +33,14 @@ __all__ = [
     "Initial",
     "LocalLeapfrog",
     "Output",
+    "Plan",
     "Pressure",
     "Result",
     "Scene",
     "Synchronous",
     "Traction",
     "constant",
+    "plan",
     "ramp",
     "realised_speed_up",
     "ricker",

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from mpi4py import MPI
 
-from complexbody import __version__, commands
+from complexbody import __version__, cli_plan, commands
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
 from complexbody.masses import SCHEMES
@@ -39,6 +39,7 @@ from complexbody.together import (
 _EPILOG = """\
 examples:
   complexbody check demos/impact.py               what would it do, and how long would it take?
+  complexbody plan demos/impact.py                what does it need, and what not?
   complexbody run demos/impact.py                 as the file says
   complexbody run demos/impact.py --set cells=80 --until 2e-5 --out results/fine
   mpirun -n 4 complexbody run demos/impact.py     the same on four processes
@@ -119,6 +120,9 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     _scene(check)
     _integrator(check)
+    planned = command("plan", cli_plan.command, cli_plan.TEXT)
+    _scene(planned)
+    _integrator(planned)
     command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
     return main
 
@@ -234,6 +238,9 @@ def _output(to: argparse.ArgumentParser) -> None:
         "--speed-up", action="store_true",
         help="local steps: time some synchronous steps in the end, and tell what was saved",
     )  # fmt: skip
+    group.add_argument(
+        "--no-plan", action="store_true", help="compute also what changes no result (see plan)"
+    )
     group.add_argument("--no-picture", action="store_true", help="do not draw")
     group.add_argument("--quiet", action="store_true", help="print only warnings and errors")
 

@@ -89,7 +89,7 @@ class Job:
         )
 
 
-def _job(a: argparse.Namespace, ranks: Any) -> Job:
+def job_of(a: argparse.Namespace, ranks: Any) -> Job:
     """Read the scene file, make its scene and the integrator; collective."""
     with together(ranks):
         file = SceneFile(a.file)
@@ -149,7 +149,7 @@ def _method(settings: Mapping[str, Any]) -> tuple[str, Any]:
 
 def run(a: argparse.Namespace, ranks: Any) -> None:
     """``complexbody run``: simulate, check, draw, and write down what was done."""
-    job = _job(a, ranks)
+    job = job_of(a, ranks)
     until = job.until
     if until is None:
         raise CommandError(
@@ -163,7 +163,7 @@ def run(a: argparse.Namespace, ranks: Any) -> None:
         progress = False if a.quiet else None
         simulation = Simulation(
             job.scene, job.method, until=until, output=output, ledger_steps=job.ledger_steps,
-            growth=growth, progress=progress,
+            growth=growth, progress=progress, plan=not a.no_plan,
         )  # fmt: skip
     if not a.quiet:
         say(ranks, *report.before(simulation, job.name, job.method, output, until))
@@ -264,7 +264,7 @@ def _recorded(
 
 def check(a: argparse.Namespace, ranks: Any) -> None:
     """``complexbody check``: build everything, and say what run would do."""
-    job = _job(a, ranks)
+    job = job_of(a, ranks)
     with together(ranks), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # null modes are part of the report
         problem = Problem(job.scene)

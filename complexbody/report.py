@@ -19,6 +19,7 @@ from complexbody import __version__, ledger, machine
 from complexbody.body import Body
 from complexbody.integrators.timetable import TimeSets
 from complexbody.output import Output
+from complexbody.planning import Plan
 from complexbody.precheck import Limits
 from complexbody.result import Result, Statistics
 from complexbody.scene import Scene
@@ -139,6 +140,14 @@ def output(plan: Output, until: float, ledger_steps: int) -> str:
     return entry("output", f"{plan.folder}{again}: {'; '.join(parts)}")
 
 
+def planned(plan: Plan | None) -> list[str]:
+    """Components that stay zero and are left out, if any."""
+    if plan is None or not plan.left_out:
+        return []
+    live, left = ", ".join(plan.components), ", ".join(plan.left_out)
+    return [entry("plan", f"{live} are computed; {left} stay zero (--no-plan computes them, too)")]
+
+
 def memory(bytes_per_cell: float, cells: int) -> str:
     """Memory of the arrays beside dolfinx's mesh."""
     total = bytes_per_cell * cells / 1e6
@@ -154,6 +163,7 @@ def before(job: Any, name: str, method: Any, plan: Output, until: float) -> list
         integrator(name, method),
         step(job.run_, method, until),
         *time_sets(job.run_.time_sets),
+        *planned(job.plan),
         memory(s.bytes_per_cell, s.cells),
         output(plan, until, job.every),
     ]

@@ -13,6 +13,7 @@ from dolfinx import fem
 
 from complexbody.integrators.timetable import TimeSets
 from complexbody.ledger import Ledger
+from complexbody.planning import Plan
 from complexbody.scene import Scene
 
 Array = npt.NDArray[np.float64]
@@ -57,6 +58,7 @@ class Result:
         scene: What was simulated; folder: where output went, or None.
         integrator: How.
         time_sets: Who acted when, and what that saves; None where all cells act together.
+        plan: What was left out since it changes no result; None if nothing was to be.
         solving: What implicit steps took and γ, Ξ and T₀ of the inertia, in words; "" if explicit.
     """
 
@@ -73,3 +75,4 @@ class Result:
     integrator: Any = None
     time_sets: TimeSets | None = None
     solving: str = ""
+    plan: Plan | None = None

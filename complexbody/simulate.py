@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from complexbody import planning
 from complexbody.errors import SceneError, SolverError
 from complexbody.files import CsvWriter
 from complexbody.integrators.asynchronous import AVI
@@ -56,7 +57,7 @@ def simulate(
             per cent of the run, but at least a hundred rows.
         growth: Stop when energy from nowhere exceeds this multiple of what was put in; None: never.
         progress: Show progress on rank 0; by default where standard error is a terminal.
-        plan: Leave out what changes no result (:mod:`complexbody.plan`); False runs everything.
+        plan: Leave out what changes no result (:func:`complexbody.planning.plan`); False: nothing.
 
     Returns:
         Fields at the final time, ledger, probes and statistics.
@@ -105,6 +106,7 @@ class Simulation:
         self.problem = Problem(scene, reduce=plan)
         self.run_: Run = method.prepare(self.problem, until)
         self.problem.release()
+        self.plan = planning.of_run(self.problem, method) if plan else None
         self.last = int(np.ceil(until / self.run_.step - 1e-9))
         self.times = output.schedule(until) if output is not None else np.zeros(0)
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
@@ -258,7 +260,7 @@ class Simulation:
         fields = (f["u"], f["nu"], f["u_dot"], f["nu_dot"])
         return Result(
             *fields, t, self.books.ledger, s, self.scene, probes, folder, self.method,
-            self.run_.time_sets, getattr(self.run_, "summary", str)(),
+            self.run_.time_sets, getattr(self.run_, "summary", str)(), self.plan,
         )  # fmt: skip
 
     # --- what leaves the run -------------------------------------------------------------------
