@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from complexbody.histories import Constant
 from complexbody.integrators.synchronous import Synchronous
+from complexbody.invariance import AXES, invariant_axes
 from complexbody.precheck import Limits, limits
 from complexbody.problem import Problem
 from complexbody.stiffness import DELTA
@@ -258,7 +259,11 @@ def _scales(problem: Problem, found: Limits, until: float | None) -> tuple[Scale
 def _suggestions(
     problem: Problem, found: Limits, times: tuple[Scale, ...], until: float | None
 ) -> list[str]:
-    out = []
+    out = [
+        f"Lower dimension: nothing varies along {AXES[axis]}. The same bodies, supports and loads "
+        "on a mesh of the cross-section give the same fields."
+        for axis in invariant_axes(problem)
+    ]
     of = {(s.field, s.what): s.seconds for s in times}
     dim = problem.disc.dim
     if np.isfinite(found.smallest):

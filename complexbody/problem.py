@@ -48,6 +48,7 @@ class Problem:
         node_step: h of its inertia Ω + h²S/4 [s], of all nodes or each (dolfinx's numbers).
         moving: (node, component) of supports that move, sorted by node; own numbering.
         load_position, load_group, load_value: Entries of load vectors in flat node records.
+        start: Initial fields and rates of all geometry nodes, without supports.
         inertias: The bodies as the user gave them: of those with a general χ(ν, ν̇), ``scene`` has
             the lower bound γI in its place.
         convexity, kinetic_range: Of general χ: how γ, Ξ and T₀ are measured (None if there is no
@@ -69,7 +70,7 @@ class Problem:
         assert np.array_equal(dofs, _compat.cell_nodes(scene.mesh))
         self.supports = boundary.supports(scene, self.action)
         self.loads = boundary.loads(scene, self.action)
-        self._start = boundary.initial(scene, self.action)
+        self.start = boundary.initial(scene, self.action)
         self._read_inertia()
         self.node_step: float | Array = 0.0
         self.arrange()
@@ -77,7 +78,7 @@ class Problem:
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
         self.full: Problem = self
         if reduce:
-            self.live = live(self.scene, self.supports, self.loads, self._start)
+            self.live = live(self.scene, self.supports, self.loads, self.start)
         if not self.live.all:
             self._reduce()
 
@@ -86,8 +87,8 @@ class Problem:
         self.full = full = copy.copy(self)
         full.full, full.live = full, replace(self.live, components=tuple(range(self.live.total)))
         del self.disc  # the other one's, from now on
-        self.supports, self.loads, self._start = reduced_data(
-            self.live, self.supports, self.loads, self._start
+        self.supports, self.loads, self.start = reduced_data(
+            self.live, self.supports, self.loads, self.start
         )
         nu = np.array([i for i in self.live.components if i >= self.whole.displacement], dtype=int)
         nu -= self.whole.displacement
@@ -123,7 +124,7 @@ class Problem:
         if not any(callable(body.inertia) for body in self.inertias):
             return
         self.convexity = Convexity(self.scene)
-        fields, rates = (a.copy() for a in self._start)
+        fields, rates = (a.copy() for a in self.start)
         rows, columns = np.nonzero(self.supports.fixed)
         fields[rows, columns] = self.supports.targets(rows, columns, 0.0)
         rates[rows, columns] = 0.0
@@ -167,7 +168,7 @@ class Problem:
         number = disc.number
         self.load_position = number[self.loads.node] * disc.record + self.loads.component
         self.load_group, self.load_value = self.loads.group, self.loads.value
-        self._initial(*self._start, fixed)
+        self._initial(*self.start, fixed)
 
     def stiffen(self, step: float | Array) -> None:
         """Give nodes the inertia Ω + h²S/4 of an implicit self-action; kept by ``arrange``.
