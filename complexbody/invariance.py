@@ -41,6 +41,13 @@ def invariant_axes(problem: Problem) -> list[int]:
     return found
 
 
+def _over_ranks(comm: Any, values: Any, op: Any) -> npt.NDArray[np.bool_]:
+    """True where all (MPI.MIN) or any (MPI.MAX) ranks have it."""
+    out = np.array(values, dtype=np.int64)
+    comm.Allreduce(MPI.IN_PLACE, out, op=op)
+    return out > 0
+
+
 def _range(problem: Problem, axis: int) -> tuple[float, float]:
     x = problem.whole.mesh.geometry.x[:, axis]
     low = problem.comm.allreduce(float(x.min(initial=np.inf)), op=MPI.MIN)
@@ -130,13 +137,13 @@ def _ends(problem: Problem, axis: int) -> bool:
     for end in (low, high):
         there = np.abs(x - end) < tiny
         every &= np.all((fixed & still)[there], axis=0)
-    held = comm.allreduce(every.astype(int), op=MPI.MIN) > 0
+    held = _over_ranks(comm, every, MPI.MIN)
     for end in (low, high):
         # Held at an end where sides are not: that bends a free component.
         there = np.abs(x - end) < tiny
         sides = np.any(fixed[there], axis=0)
         some |= sides & ~np.any(fixed[~there], axis=0)
-    some = comm.allreduce(some.astype(int), op=MPI.MAX) > 0
+    some = _over_ranks(comm, some, MPI.MAX)
     if np.any(some & ~held):
         return False
     # What starts or is driven is no field that stays zero.
@@ -144,7 +151,7 @@ def _ends(problem: Problem, axis: int) -> bool:
     for values in problem.start:
         moved[np.any((values != 0) & ~fixed, axis=0)] = 1
     moved[problem.loads.component] = 1
-    if np.any(held & (comm.allreduce(moved, op=MPI.MAX) > 0)):
+    if np.any(held & _over_ranks(comm, moved, MPI.MAX)):
         return False
 
     def kind(i: int) -> tuple[int, bool, bool]:
