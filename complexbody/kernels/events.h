@@ -29,7 +29,7 @@ INLINE void gather_records(const world *s, const int32_t *c, vec out[NR]) {
   vec r[4];
   for (int l = 0; l < 4; l++) {
     const half a = *(const half *)record_of(s, c[l]), b = *(const half *)record_of(s, c[l + 4]);
-    r[l] = (vec){a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]};
+    r[l] = JOIN(a, b);
   }
   transpose4(r);
   for (int i = 0; i < 4; i++) out[i] = r[i];
@@ -91,7 +91,7 @@ INLINE void give(const world *s, const int32_t *c, const vec weight, const vec i
   transpose4(f);
   for (int l = 0; l < W; l++) {
     const vec p = f[l % 4];
-    const nvec q = l < 4 ? (nvec){p[0], p[1], p[2], p[3]} : (nvec){p[4], p[5], p[6], p[7]};
+    const nvec q = l < 4 ? LOW(p) : HIGH(p);
     double *r = record_of(s, c[l]);
     const double *m = s->inverse_mass + (s->klass ? s->klass[c[l]] : 0) * NR;
     *(nvec *)(r + PART * NR) += r[INVERSE] * *(const nvec *)m * q;

@@ -14,6 +14,23 @@ typedef double vec_u __attribute__((vector_size(8 * W), aligned(8)));
 
 #if W == 8
 typedef double half __attribute__((vector_size(32), aligned(8)));
+/* Halves by one instruction each: element by element they take half of a force's time. */
+#ifdef __has_builtin
+#define HALVES __has_builtin(__builtin_shufflevector)
+#else
+#define HALVES 0
+#endif
+typedef double pair __attribute__((vector_size(16), aligned(8)));
+#if HALVES
+#define PAIR(v, i) __builtin_shufflevector(v, v, 2 * (i), 2 * (i) + 1)
+#define LOW(v) __builtin_shufflevector(v, v, 0, 1, 2, 3)
+#define HIGH(v) __builtin_shufflevector(v, v, 4, 5, 6, 7)
+#define JOIN(a, b) __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7)
+#else
+#define LOW(v) ((half){(v)[0], (v)[1], (v)[2], (v)[3]})
+#define HIGH(v) ((half){(v)[4], (v)[5], (v)[6], (v)[7]})
+#define JOIN(a, b) ((vec){(a)[0], (a)[1], (a)[2], (a)[3], (b)[0], (b)[1], (b)[2], (b)[3]})
+#endif
 /* Transpose an 8 x 8 block held in 8 vectors. */
 INLINE void transpose(vec r[W]) {
   vec s[8], t[8];
@@ -72,10 +89,18 @@ INLINE void gather(const double *restrict x, const int32_t *c, vec out[NR]) {
   vec r[4];
   for (int l = 0; l < 4; l++) {
     half a = *(const half *)(x + 4 * (int64_t)c[l]), b = *(const half *)(x + 4 * (int64_t)c[l + 4]);
-    r[l] = (vec){a[0], a[1], a[2], a[3], b[0], b[1], b[2], b[3]};
+    r[l] = JOIN(a, b);
   }
   transpose4(r);
   for (int i = 0; i < 4; i++) out[i] = r[i];
+#elif NR == 2 && W == 8 && HALVES
+#define AT(l) (*(const pair *)(x + 2 * (int64_t)c[l]))
+  const half a = __builtin_shufflevector(AT(0), AT(1), 0, 1, 2, 3), b = __builtin_shufflevector(AT(2), AT(3), 0, 1, 2, 3);
+  const half d = __builtin_shufflevector(AT(4), AT(5), 0, 1, 2, 3), e = __builtin_shufflevector(AT(6), AT(7), 0, 1, 2, 3);
+#undef AT
+  const vec low = JOIN(a, b), high = JOIN(d, e);
+  out[0] = SHUFFLE(low, high, 0, 2, 4, 6, 8, 10, 12, 14);
+  out[1] = SHUFFLE(low, high, 1, 3, 5, 7, 9, 11, 13, 15);
 #else
   for (int l = 0; l < W; l++)
     for (int i = 0; i < NR; i++) out[i][l] = x[(int64_t)c[l] * NR + i];
@@ -95,8 +120,14 @@ INLINE void scatter(double *restrict f, const int32_t *c, const vec in[NR]) {
   vec r[4];
   for (int i = 0; i < 4; i++) r[i] = in[i];
   transpose4(r);
-  for (int l = 0; l < 4; l++) *(half *)(f + 4 * (int64_t)c[l]) += (half){r[l][0], r[l][1], r[l][2], r[l][3]};
-  for (int l = 0; l < 4; l++) *(half *)(f + 4 * (int64_t)c[l + 4]) += (half){r[l][4], r[l][5], r[l][6], r[l][7]};
+  for (int l = 0; l < 4; l++) *(half *)(f + 4 * (int64_t)c[l]) += LOW(r[l]);
+  for (int l = 0; l < 4; l++) *(half *)(f + 4 * (int64_t)c[l + 4]) += HIGH(r[l]);
+#elif NR == 2 && W == 8 && HALVES
+  const vec low = SHUFFLE(in[0], in[1], 0, 8, 1, 9, 2, 10, 3, 11), high = SHUFFLE(in[0], in[1], 4, 12, 5, 13, 6, 14, 7, 15);
+#define ADD(l, v, i) *(pair *)(f + 2 * (int64_t)c[l]) += PAIR(v, i)
+  ADD(0, low, 0); ADD(1, low, 1); ADD(2, low, 2); ADD(3, low, 3);
+  ADD(4, high, 0); ADD(5, high, 1); ADD(6, high, 2); ADD(7, high, 3);
+#undef ADD
 #else
   for (int l = 0; l < W; l++)
     for (int i = 0; i < NR; i++) f[(int64_t)c[l] * NR + i] += in[i][l];
