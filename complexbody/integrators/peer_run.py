@@ -9,6 +9,8 @@ matrices assembled.
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import numpy.typing as npt
 
@@ -105,6 +107,24 @@ class PeerRun:
     def _step(self) -> str:
         """Bring q (with its ghosts) and v to the end of a step; why not, in words."""
         raise NotImplementedError
+
+    @cached_property
+    def inverse_mass(self) -> Blocks:
+        """M⁻¹ of free components, zero on prescribed ones; made at first use, collectively."""
+        masses, disc = self.problem.masses, self.problem.disc
+        inverse = np.zeros_like(self.mass_by_class)
+        for out, mass, fixed in zip(inverse, self.mass_by_class, masses.fixed, strict=True):
+            free = np.ix_(~fixed, ~fixed)
+            out[free] = np.linalg.inv(mass[free])
+        by_node = inverse[masses.classes[:-1]] / disc.volume[:, None, None]
+        return self.system.blocks(by_node)
+
+    def accelerations(self, t: float, v: Array) -> Array:
+        """M⁻¹(F(t) − Dv − r), r being there already; zero where prescribed."""
+        force = self.system.force(t) - self.system.r
+        if self.damping is not None:
+            force -= self.damping.times(v, self._one)
+        return self.inverse_mass.times(force, np.empty_like(force))
 
     def _book(self, x: Array, v: Array) -> None:
         """Work and dissipation of the step from (x, v)."""
