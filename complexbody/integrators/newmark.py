@@ -19,7 +19,7 @@ from petsc4py import PETSc
 from complexbody import _compat
 from complexbody.integrators.global_newton import REASONS
 from complexbody.integrators.peer_run import PeerRun
-from complexbody.integrators.solvers import Operator, options
+from complexbody.integrators.solvers import KRYLOV, Operator, options
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 PREFIX = "cb_newmark_"
-DEFAULTS = {"ksp_type": "cg", "pc_type": "sor", "ksp_max_it": "10000"}
 
 
 class NewmarkRun(PeerRun):
@@ -61,7 +60,7 @@ class NewmarkRun(PeerRun):
             self.ksp.setOptionsPrefix(PREFIX)
             self.ksp.setOperators(self.operator.matrix)
             self.ksp.setInitialGuessNonzero(True)
-            with options(PREFIX, DEFAULTS | {"ksp_rtol": str(method.tolerance)}, given):
+            with options(PREFIX, KRYLOV | {"ksp_rtol": str(method.tolerance)}, given):
                 self.ksp.setFromOptions()
             self.ksp.setUp()
         else:
@@ -69,7 +68,7 @@ class NewmarkRun(PeerRun):
             self.snes.setOptionsPrefix(PREFIX)
             self.snes.setFunction(self._function, self.right)
             self.snes.setJacobian(self._jacobian, self.operator.matrix)
-            with options(PREFIX, DEFAULTS | {"ksp_rtol": "1e-6"}, given):
+            with options(PREFIX, KRYLOV | {"ksp_rtol": "1e-6"}, given):
                 self.snes.setFromOptions()
 
     def _step(self) -> str:

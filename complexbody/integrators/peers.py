@@ -78,14 +78,6 @@ def _given_step(method: Any, until: float) -> float:
     return _divided(method.step, until)
 
 
-def _critical(problem: Problem) -> float:
-    """The critical synchronous step without viscosity [s]; infinite without stiffness."""
-    try:
-        return critical_step(problem, "symmetric")
-    except StepError:
-        return float("inf")
-
-
 def _positive(method: Any, *names: str) -> None:
     for name in names:
         value = getattr(method, name)
@@ -237,8 +229,7 @@ class Newmark:
             IntegratorError: for a scene this integrator cannot take.
         """
         _require_momenta(self, problem)
-        step = _given_step(self, until)
-        return NewmarkRun(problem, self, step, _critical(problem))
+        return NewmarkRun(problem, self, _given_step(self, until), float("inf"))
 
 
 @dataclass(frozen=True)
@@ -254,7 +245,8 @@ class PetscTS:
             method; "cn": trapezoidal rule; "theta": implicit midpoint rule.
         step: Step h [s], shortened so that the end of the run falls on a step; of "rk4" by default
             ``safety`` times its critical one.
-        radius: Of "alpha2": spectral radius at infinite frequency, 1 (no damping) to 0.
+        radius: Of "alpha2": spectral radius at infinite frequency, 1 (no damping) to 0. PETSc 3.18
+            starts from twice the acceleration, which 1 does not see; else it costs an order.
         safety: Fraction of the critical step to use.
         tolerance: Of solvers, relative to the first residual of a step.
         options: More PETSc options, without the prefix (in "cn" and "theta" for the solver inside
@@ -285,8 +277,10 @@ class PetscTS:
 
     @property
     def order(self) -> int:
-        """Order of convergence in the step."""
-        return 4 if self.kind == "rk4" else 2
+        """Order of convergence in the step; of "alpha2" see ``radius``."""
+        if self.kind == "rk4":
+            return 4
+        return 1 if self.kind == "alpha2" and self.radius < 1 else 2
 
     @property
     def explicit(self) -> bool:
@@ -307,20 +301,20 @@ class PetscTS:
             IntegratorError: for a scene this integrator cannot take.
         """
         _require_momenta(self, problem)
-        critical = _critical(problem)
         if not self.explicit:
-            return PetscRun(problem, self, _given_step(self, until), critical)
-        critical = _limit_rk4(problem, critical)
+            return PetscRun(problem, self, _given_step(self, until), float("inf"))
+        critical = _limit_rk4(problem)
         return PetscRun(problem, self, _explicit_step(self, critical, until), critical)
 
 
-def _limit_rk4(problem: Problem, critical: float) -> float:
+def _limit_rk4(problem: Problem) -> float:
     """Critical step of the classical Runge–Kutta method [s], from that of the leapfrog.
 
     Its region of stability holds the left half of the disc of radius 2.615 and the real axis down
     to −2.785. Eigenvalues are in that disc (underdamped, |λ| ≤ ω ≤ 2/critical) or real and not
     below −max η/ρ̄ (overdamped).
     """
+    critical = critical_step(problem, "symmetric")
     rates = [
         scipy.linalg.eigvalsh(body.viscosity_matrix, body.inertia_matrix)[-1]
         for body in problem.inertias

@@ -11,7 +11,8 @@ Steps are never adapted.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from petsc4py import PETSc
 from complexbody import _compat
 from complexbody.integrators.global_newton import REASONS
 from complexbody.integrators.peer_run import PeerRun
-from complexbody.integrators.solvers import Operator, options
+from complexbody.integrators.solvers import KRYLOV, Operator, options
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -29,7 +30,19 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 PREFIX, INNER = "cb_ts_", "cb_ts_inner_"
-KRYLOV = {"ksp_type": "cg", "pc_type": "sor", "ksp_max_it": "10000"}
+
+
+class Form(Protocol):
+    """The equations as a stepper wants them, and the vectors it works on."""
+
+    def read(self) -> None:
+        """Take x and v from PETSc."""
+
+    def iterations(self) -> int:
+        """Linear iterations since the last call."""
+
+    def close(self) -> None:
+        """Free PETSc's objects."""
 
 
 class PetscRun(PeerRun):
@@ -102,8 +115,14 @@ class SecondOrder:
     def __init__(self, run: PetscRun, defaults: dict[str, str]) -> None:
         self.run, self.operator, self._seen = run, Operator(run), 0
         run.ts.setType("alpha2")
-        # What setFromOptions reads goes before what is set.
         defaults |= KRYLOV | {"ts_alpha_radius": str(run.method.radius)}
+        if run.system.linear:
+            # Rates follow from the fields where the residual is: it must be seen at the solution.
+            tolerance = run.method.tolerance
+            defaults |= {
+                "snes_type": "newtonls", "snes_linesearch_type": "basic",
+                "snes_rtol": str(tolerance), "ksp_rtol": str(0.5 * tolerance),
+            }  # fmt: skip
         self.x, self.v, self.out = (
             _compat.petsc_vector(run.system.q).duplicate() for _ in range(3)
         )  # fmt: skip
@@ -290,4 +309,6 @@ class Theta(FirstOrder):
             thing.destroy()
 
 
-FORMS = {"alpha2": SecondOrder, "rk4": FirstOrder, "cn": Theta, "theta": Theta}
+FORMS: dict[str, Callable[[PetscRun, dict[str, str]], Form]] = {
+    "alpha2": SecondOrder, "rk4": FirstOrder, "cn": Theta, "theta": Theta,
+}  # fmt: skip

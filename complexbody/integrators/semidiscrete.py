@@ -6,7 +6,7 @@ r"""The semi-discrete equations on dolfinx's own vectors, as one would write the
 q = (u, ν) at the nodes, r by ``ufl.derivative`` of the scene's action, M and D the lumped masses
 and viscosities of this package, F the loads with their histories. Vectors are this rank's owned
 unknowns, node by node. Peers of our integrators step these equations; it knows no time step.
-"""  # noqa: D400, D415
+"""  # noqa: D415
 
 from __future__ import annotations
 

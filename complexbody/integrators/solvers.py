@@ -5,13 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
 
 if TYPE_CHECKING:
     from complexbody.integrators.peer_run import PeerRun
+
+#: Linear solvers of implicit peers, by default.
+KRYLOV = {
+    "ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "10000", "pc_type": "sor",
+}  # fmt: skip
 
 
 @contextmanager
