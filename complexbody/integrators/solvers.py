@@ -42,7 +42,7 @@ def options(prefix: str, defaults: Mapping[str, str], given: Mapping[str, str]) 
         yield
     except PETSc.Error as error:
         raise IntegratorError(
-            f"PETSc does not take its options: {last_line(error)}. Change options={dict(given)}, or "
+            f"PETSc does not take its options: {last_line(error)}. Change options={dict(given)} or "
             f"those on its command line that begin with {prefix}."
         ) from error
     finally:
