@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 #: Linear solvers of implicit peers, by default.
 KRYLOV = {
-    "ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "10000", "pc_type": "sor",
+    "ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "10000",
+    "pc_type": "bjacobi", "sub_pc_type": "icc",
 }  # fmt: skip
 
 
