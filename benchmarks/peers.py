@@ -3,10 +3,10 @@
 
     python benchmarks/peers.py [--cells 15]
 
-A cube of 6·cells³ scattered tetrahedra of the scaled icosahedral quasicrystal (6 components,
-viscous phason). Explicit methods make the same step, 0.9 of the critical one; implicit ones 0.9, 5, 20 of
-it. Contenders take turns; the smallest processor time of the rounds counts. Ratios are of time per
-step and per simulated time; "updates" are passes over all cells per step.
+A cube of 6·cells³ scattered tetrahedra of the scaled icosahedral quasicrystal (6 components, a
+viscous phason). Explicit methods make the same step, 0.9 of the critical one; implicit ones 0.9, 5
+and 20 of it. Contenders take turns; the smallest processor time of the rounds counts. Ratios are of
+time per step and per simulated time; "updates" are passes over all cells per step.
 """
 
 from __future__ import annotations
