@@ -101,7 +101,7 @@ class Implicit:
             return same.prepare(problem, until)
         require_explicit_self_action(problem.scene, "solving for momenta")
         # By body: masses are those of this rank's nodes, and all ranks must say the same.
-        if any(np.linalg.eigvalsh(b.inertia_matrix)[0] <= 0 for b in problem.scene.bodies):
+        if any(np.any(np.linalg.eigvalsh(b.inertia_matrix) <= 0) for b in problem.scene.bodies):
             raise IntegratorError(
                 "Implicit solves for momenta, which a descriptor without inertia does not have. "
                 "Use Synchronous() or AVI() with dissipation='exact'."
