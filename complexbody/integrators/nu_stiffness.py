@@ -63,14 +63,17 @@ class NuStiffness:
         corners = disc.cells.transpose(0, 2, 1).reshape(-1, disc.dim + 1)
         m, pair = corners.shape[1], np.int64(disc.nodes + 1)
         links = np.repeat(corners, m, axis=1).astype(np.int64) * pair + np.tile(corners, (1, m))
-        near = np.bincount(np.unique(links) // pair, minlength=disc.nodes + 1)[:-1, None]
+        links = np.unique(links)
+        near = np.bincount(links // pair, minlength=disc.nodes + 1)[:-1, None]
         room = near.astype(np.float64)
         disc.sum_shared(room)  # at least as many as there are
-        shared = np.zeros(disc.nodes, bool)
-        shared[disc.late : disc.late + disc.shared] = True
-        wanted = np.repeat(room[self.owned, 0] * k, k).astype(PETSc.IntType)
-        # A neighbour of another rank is one only of shared nodes.
-        beyond = np.where(np.repeat(shared[self.owned], k), wanted, 0).astype(PETSc.IntType)
+        # Neighbours that others own: of shared nodes perhaps all.
+        elsewhere = np.append(~disc.owned, False)[links % pair]
+        apart = np.bincount(links[elsewhere] // pair, minlength=disc.nodes + 1)[:-1]
+        apart[disc.late : disc.late + disc.shared] = room[disc.late : disc.late + disc.shared, 0]
+        wanted, beyond = (
+            np.repeat(count[self.owned] * k, k).astype(PETSc.IntType) for count in (room[:, 0], apart)
+        )  # fmt: skip
         matrix = PETSc.Mat().create(self.problem.comm)
         matrix.setSizes(((self.size, None), (self.size, None)))
         matrix.setBlockSize(k)
