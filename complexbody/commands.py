@@ -47,7 +47,7 @@ INTEGRATORS = {
 _OPTIONS = (
     "step", "safety", "dissipation", "start", "critical", "unstable_ok", "schedule", "balanced",
     "corrected", "stabilisation", "levels", "order", "quadrature", "tolerance", "iterations",
-    "monitor", "options",
+    "monitor", "options", "forces",
 )  # fmt: skip
 
 

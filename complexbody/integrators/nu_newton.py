@@ -30,7 +30,7 @@ Array = npt.NDArray[np.float64]
 DEFAULTS = {"snes_type": "newtonls", "snes_linesearch_type": "bt", "ksp_type": "cg",
             "ksp_norm_type": "unpreconditioned"}  # fmt: skip
 
-#: Stiffness over inertia and viscosity from which multigrid beats symmetric Gauss–Seidel (measured).
+#: Stiffness over inertia and viscosity from which multigrid beats symmetric Gauss–Seidel.
 STIFF = 200.0
 
 
@@ -83,7 +83,7 @@ class NuNewton:
             options.delValue(name)
 
     def _stiffness_ratio(self) -> float:
-        """Largest ratio of a diagonal entry's part by stiffness to that by inertia and viscosity."""
+        """Largest ratio of a diagonal entry's stiffness to its inertia and viscosity."""
         stiff = self.run.theta * self._own
         free = self.stiffness.free & (self._whole > stiff)
         ratio = float((stiff[free] / (self._whole - stiff)[free]).max(initial=0.0))
@@ -144,5 +144,6 @@ class NuNewton:
 
     def close(self) -> None:
         """Free PETSc's objects."""
-        for thing in (self.snes, self._residual, self.vector, self.stiffness):
-            (thing.close if thing is self.stiffness else thing.destroy)()
+        for thing in (self.snes, self._residual, self.vector):
+            thing.destroy()
+        self.stiffness.close()

@@ -72,7 +72,8 @@ class NuStiffness:
         apart = np.bincount(links[elsewhere] // pair, minlength=disc.nodes + 1)[:-1]
         apart[disc.late : disc.late + disc.shared] = room[disc.late : disc.late + disc.shared, 0]
         wanted, beyond = (
-            np.repeat(count[self.owned] * k, k).astype(PETSc.IntType) for count in (room[:, 0], apart)
+            np.repeat(count[self.owned] * k, k).astype(PETSc.IntType)
+            for count in (room[:, 0], apart)
         )  # fmt: skip
         matrix = PETSc.Mat().create(self.problem.comm)
         matrix.setSizes(((self.size, None), (self.size, None)))
@@ -133,10 +134,8 @@ class NuStiffness:
             if p < 0 and q < 0:
                 product = mass
             else:
-                left, right = (
-                    B[:, :, m] if m >= 0 else np.broadcast_to(root[:, None] / (d + 1), B[:, :, 0].shape)
-                    for m in (p, q)
-                )  # fmt: skip
+                mean = np.broadcast_to(root[:, None] / (d + 1), B[:, :, 0].shape)
+                left, right = (B[:, :, m] if m >= 0 else mean for m in (p, q))
                 product = left[:, :, None] * right[:, None, :]
             out[:, :, :, a, :, b] += (entry * product).transpose(0, 3, 1, 2)
         return out.reshape(len(blocks) * W, (d + 1) * k, (d + 1) * k)
@@ -150,7 +149,7 @@ class NuStiffness:
 
     def _tabulated(self, number: int, blocks: Any, x: Array) -> Array:
         """By FFCx's second derivative, at the state x."""
-        problem, disc, kernels = self.problem, self.problem.disc, self.problem.kernels
+        disc, kernels = self.problem.disc, self.problem.kernels
         m, n, k = disc.dim + 1, disc.n, self.k
         if not hasattr(self, "_forms"):
             self._forms: dict[int, Any] = {}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-r"""The books of a run that is implicit in ν: works, dissipation, and what its discrete energy obeys.
+r"""The books of a run that is implicit in ν: works, dissipation, and its discrete energy.
 
 Sums are taken step by step with the forces and loads that the step saw. Between the midpoints x̄ of
 two neighbouring steps j−1 and j, for linear forces and ϑ = ½, the momentum of ν obeys

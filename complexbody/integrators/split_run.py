@@ -140,7 +140,8 @@ class SplitRun(ForceRun):
         """Solve for the step from t_n, leaving the state at t_n as it is."""
         if self.ahead:
             return
-        problem, kernels, h, n, n_u = self.problem, self.problem.kernels, self.step, self.n, self.n_u
+        problem, h, n, n_u = self.problem, self.step, self.n, self.n_u
+        kernels = problem.kernels
         self.start[:] = kernels.x[:-1, :n]
         self.moved[:, :n_u] = 0.5 * h * self.rate[:, :n_u]
         guess = 2 * self._drifts[0] - self._drifts[1] if self.steps > 1 else self._drifts[0].copy()
@@ -169,7 +170,8 @@ class SplitRun(ForceRun):
 
     def _commit(self) -> None:
         """Take the step that was solved for, and book it."""
-        problem, kernels, h, n, n_u = self.problem, self.problem.kernels, self.step, self.n, self.n_u
+        problem, h, n, n_u = self.problem, self.step, self.n, self.n_u
+        kernels = problem.kernels
         delta = self.moved[:, n_u:]
         before = self.rate.copy()
         self.rate[:, :n_u] = self.after
