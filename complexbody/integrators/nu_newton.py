@@ -49,6 +49,7 @@ class NuNewton:
         nodal = masses.inertia / (theta * h * h) + masses.viscosity / h
         self.nodal = nodal[klass] * run.problem.disc.volume[:, None, None]
         self.delta = np.zeros((run.problem.disc.nodes, self.stiffness.k))
+        self._known: Array | None = None
         self.stiffness.assemble(theta, self.nodal, run.problem.kernels.x)
         # Sizes of the terms that cancel in a residual, for its tolerance.
         self._whole = np.abs(self.stiffness.matrix.getDiagonal().array) * self.stiffness.free
@@ -104,7 +105,9 @@ class NuNewton:
         return np.where(self.stiffness.free, self.stiffness.local(out), 0.0)
 
     def _function(self, snes: Any, x: Any, out: Any) -> None:
-        out.array[:] = self._evaluate(x.array_r)
+        # The first state that SNES asks for is the guess, where the residual is known.
+        known, self._known = self._known, None
+        out.array[:] = self._evaluate(x.array_r) if known is None else known
 
     def _jacobian(self, snes: Any, x: Any, J: Any, P: Any) -> None:
         if not self.stiffness.constant:
@@ -120,7 +123,7 @@ class NuNewton:
         """
         run, stiffness = self.run, self.stiffness
         start = stiffness.local(guess)
-        first = self._evaluate(start)
+        first = self._known = self._evaluate(start)
         nu = stiffness.local(run.start[:, self.problem.disc.n - stiffness.k :])
         terms = (first, self._whole * start, self._own * nu)
         squares = np.array([np.sum(t * t) for t in terms])
