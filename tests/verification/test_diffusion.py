@@ -72,21 +72,22 @@ def test_orders(comm, rho, eta, order):
     assert np.all(slopes(steps, books) > order - 0.25), books
 
 
-def test_stiff_diffusion_takes_the_waves_step(comm):
-    """300 times the explicit limit of ν, which ``Synchronous`` names: waves of u within 1 %."""
-    cells, eta, stiff, until = 40, 0.05, 40.0, 2.0
+@pytest.mark.parametrize("stiff, ratio", ((0.4, 300), (40.0, 3e4)))
+def test_stiff_diffusion_takes_the_waves_step(comm, stiff, ratio):
+    """Far beyond the explicit limit of ν, which ``Synchronous`` names: waves of u within 1 %."""
+    cells, eta, until = 40, 0.05, 2.0
     limit = eta / cells**2 / (2 * stiff)
     scene = pair(comm, cells, 0.0, eta, stiff=stiff)
     step = 0.5 / cells
-    assert step > 300 * limit
+    assert step > ratio * limit
     with refused(StepError, "critical step", f"{critical_step(Problem(scene)):.6g}"):
         cb.simulate(scene, cb.Synchronous(step), until=until)
     exact = amplitudes(until, cells, 0.0, eta, stiff=stiff)
-    for order, bound in ((2, 0.01), (1, 0.01)):
+    for order, bound in ((2, 0.01), (1, 0.02)):
         method = cb.Implicit(step, order=order, forces="implicit")
         result = cb.simulate(scene, method, until=until)
         found = errors(result, exact)
-        assert found[0] < bound and found[2] < np.pi * bound, found
+        assert max(found[:2]) < bound and found[2] < np.pi * bound, found
         assert "1.00 Newton iterations per step" in result.solving
         if order == 2:
             assert np.abs(result.ledger["identity"]).max() < 1e-11
