@@ -4,8 +4,8 @@
     python benchmarks/diffusion.py [--cells 40 80] [--diffusivity 0.2 2]
 
 A scalar pair on a square, ½|∇u|² + R∇u·∇ν + ½K|∇ν|² + ½k0ν², ρ = 1, no inertia of ν and η = 1, so
-that K is ν's diffusivity; u, ν ∝ cos πx cos πy, whose motion is a 3×3 matrix exponential. Errors are
-those of (u, ν) in the mean over nodes, relative to the mean of u at the start; times are of
+that K is ν's diffusivity; u, ν ∝ cos πx cos πy, whose motion is a 3×3 matrix exponential. Errors
+are those of (u, ν) in the mean over nodes, relative to the mean of u at the start; times are of
 stepping alone, both runs side by side, the least of three.
 """
 
