@@ -185,7 +185,11 @@ def _integrator(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--order", type=int, choices=(1, 2),
-        help="implicit: midpoint (2, default) or the paper's scheme (1)",
+        help="implicit: midpoint (2, default), or the paper's scheme or backward Euler (1)",
+    )  # fmt: skip
+    group.add_argument(
+        "--forces", choices=("explicit", "implicit"),
+        help="implicit: those on ν explicit (default), or solved for at the step of u alone",
     )  # fmt: skip
     group.add_argument(
         "--quadrature", choices=("vertex", "consistent"),

@@ -24,6 +24,9 @@ from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
 
+#: In the place of a dissipation scheme: ν is held (an infinite inertia), the step is that of u.
+HELD = "held"
+
 
 def cell_densities(problem: Problem) -> Array:
     """ρ of every cell in blocks, shape (blocks, W); padding has 1."""
@@ -126,7 +129,8 @@ class _Region:
         mu = np.empty((*h.shape, self.n))
         mu[..., : self.n_u] = self.rho[..., None]
         m = self.m + 0.25 * h[..., None] ** 2 * self.s
-        mu[..., self.n_u :] = effective(m, self.d, h[..., None], scheme)
+        held = scheme == HELD
+        mu[..., self.n_u :] = np.inf if held else effective(m, self.d, h[..., None], scheme)
         scale = np.ascontiguousarray((1.0 / np.sqrt(mu)).transpose(0, 2, 1))
         if self.matrices is None:
             values = quadratic_eigenvalues(
@@ -143,7 +147,8 @@ class _Region:
     def steps(self, scheme: str) -> Array:
         """Largest h per cell with h²λ_K(h) ≤ 4, shape (blocks, W); inf where nothing limits it."""
         h = np.ones(self.geometry.shape[::2])
-        if not np.any(self.s) and (not np.any(self.d) or scheme == "symmetric"):
+        constant = not np.any(self.s) and (not np.any(self.d) or scheme == "symmetric")
+        if scheme == HELD or constant:
             with np.errstate(divide="ignore"):
                 return 2.0 / np.sqrt(np.maximum(self.eigenvalues(h, scheme), 0.0))
         # h² λ(h) grows like a power of h between 1 and 2; bracket it from below in log scale.
