@@ -330,7 +330,6 @@ def bubble(comm, stretch):
     return scene, Bubble(1e-3, c["density"], c["pressure"], c["gamma"], S=S)
 
 
-@pytest.mark.filterwarnings("ignore:The energy of bubbly liquid does not see")
 def test_rayleigh_plesset(comm):
     """Free oscillation from 1.6 R0 down to half of it: radius in the period's course, order 2."""
     _, reference = bubble(comm, 1.6)
@@ -345,7 +344,6 @@ def test_rayleigh_plesset(comm):
     assert found[1] < 1e-7
 
 
-@pytest.mark.filterwarnings("ignore:The energy of bubbly liquid does not see")
 def test_rayleigh_collapse(comm):
     """A bubble of 8 R0 falls in about Rayleigh's time; large steps are refused at its bottom."""
     scene, reference = bubble(comm, 8.0)
