@@ -16,6 +16,8 @@ from complexbody.hessian import names
 
 Array = npt.NDArray[np.float64]
 
+#: Eigenvalues, of matrices with a unit diagonal, that are zero but for round-off.
+NULL = 1e-11
 #: λ/μ from which on P1 cells are said to lock.
 LOCKING = 50.0
 
@@ -44,6 +46,62 @@ def check_coercive(
     n, labels = n_u + k, names(n_u, k)
     if not np.all(np.isfinite(hessian)):
         raise CoercivityError(f"The energy of {name} has a Hessian that is not finite. Check it.")
+    keep, h, d = _scaled(hessian, n_u, k, dim)
+    values, vectors = np.linalg.eigh(h)
+    worst = int(np.argmin(values[:, 0]))
+
+    def words(vector: Array, scale: Array) -> str:
+        mode = vector / scale
+        mode = mode / mode[np.argmax(np.abs(mode))]
+        big = [i for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.05][:6]
+        return " ".join(f"{mode[i]:+.3g} {labels[keep[i]]}" for i in big)
+
+    if values[worst, 0] < -NULL:
+        mode = vectors[worst, :, 0]
+        amount = float(mode @ h[worst] @ mode)
+        raise CoercivityError(
+            f"The energy of {name} is not coercive (A1): along the mode {words(mode, d[worst])} it "
+            f"is negative (relative eigenvalue {values[worst, 0]:.3e}, g·Hg = {amount:.3e} J/m³). "
+            "Change the constants so that the coupling stays below the bound of the form."
+        )
+    free = _without_rotations(vectors[worst][:, values[worst] < NULL], d[worst], keep, n_u, n, dim)
+    if not free.size:
+        return []
+    full = np.zeros((len(labels), free.shape[1]))
+    full[keep] = free / d[worst][:, None]
+    own = np.zeros((1, k, k)) if outer is None or not len(outer) else outer
+    held = np.array([_held(full, hessian[worst], w, n_u, k) for w in own])
+    energies, turns = np.linalg.eigh(held)
+    least = int(np.argmin((energies > NULL).sum(axis=1)))
+    free = free @ turns[least][:, energies[least] <= NULL]
+    return [words(mode, d[worst]) for mode in free.T]
+
+
+def least_eigenvalue(hessian: Array, n_u: int, k: int, dim: int) -> float:
+    """Smallest eigenvalue of H scaled to a unit diagonal, rigid rotations left out; A1 if positive.
+
+    Args:
+        hessian: H of ρe, shape (m, 4n, 4n); m samples, as for :func:`check_coercive`.
+        n_u: Components of u.
+        k: Components of ν.
+        dim: Dimension of the mesh.
+
+    Returns:
+        The least of all samples; infinity if there is none.
+    """
+    keep, h, d = _scaled(hessian, n_u, k, dim)
+    least = np.inf
+    for values, vectors, scale in zip(*np.linalg.eigh(h), d, strict=True):
+        null = vectors[:, np.abs(values) < NULL]
+        turning = null.size and not _without_rotations(null, scale, keep, n_u, n_u + k, dim).size
+        rest = values[np.abs(values) >= NULL] if turning else values
+        least = min(least, float(rest.min(initial=np.inf)))
+    return least
+
+
+def _scaled(hessian: Array, n_u: int, k: int, dim: int) -> tuple[list[int], Array, Array]:
+    """Unknowns that exist, H of them with a unit diagonal (m, ·, ·), and the roots of its own."""
+    n = n_u + k
     keep = [3 * i + j for i in range(n) for j in range(dim)] + [3 * n + n_u + i for i in range(k)]
     # A descriptor the energy does not see is held by its gradients, as u is by its own.
     seen = np.abs(hessian).max(axis=(0, 2), initial=0.0) > 0
@@ -52,46 +110,37 @@ def check_coercive(
     # Units differ between U, N and ν: compare each with its own diagonal.
     d = np.sqrt(np.abs(np.einsum("mii->mi", h)))
     d = np.where(d > 0, d, d.max(axis=1, keepdims=True, initial=1e-150))  # its square is divided by
-    values, vectors = np.linalg.eigh(h / (d[:, :, None] * d[:, None, :]))
-    worst = int(np.argmin(values[:, 0]))
-    tolerance = 1e-11
+    return keep, h / (d[:, :, None] * d[:, None, :]), d
 
-    def words(vector: Array, scale: Array) -> str:
-        mode = vector / scale
-        mode = mode / mode[np.argmax(np.abs(mode))]
-        big = [i for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.05][:6]
-        return " ".join(f"{mode[i]:+.3g} {labels[keep[i]]}" for i in big)
 
-    if values[worst, 0] < -tolerance:
-        mode = vectors[worst, :, 0]
-        amount = float(mode / d[worst] @ h[worst] @ (mode / d[worst]))
-        raise CoercivityError(
-            f"The energy of {name} is not coercive (A1): along the mode {words(mode, d[worst])} it "
-            f"is negative (relative eigenvalue {values[worst, 0]:.3e}, g·Hg = {amount:.3e} J/m³). "
-            "Change the constants so that the coupling stays below the bound of the form."
-        )
-    # Rigid rotations (skw U) are the null modes that objectivity demands (Korn).
-    rotations = []
-    for i, j in itertools.combinations(range(min(n_u, dim)), 2):
-        r = np.zeros(len(labels))
-        r[3 * i + j], r[3 * j + i] = 1.0, -1.0
-        rotations.append(r[keep] * d[worst])
-    null = vectors[worst][:, values[worst] < tolerance]
-    if rotations:
-        q, _ = np.linalg.qr(np.array(rotations).T)
-        null = null - q @ (q.T @ null)
-    if not null.size:
-        return []
-    left, sizes, _ = np.linalg.svd(null, full_matrices=False)
-    free = left[:, sizes > 1e-6]
-    full = np.zeros((len(labels), free.shape[1]))
-    full[keep] = free / d[worst][:, None]
-    own = np.zeros((1, k, k)) if outer is None or not len(outer) else outer
-    held = np.array([_held(full, hessian[worst], w, n_u, k) for w in own])
-    energies, turns = np.linalg.eigh(held)
-    least = int(np.argmin((energies > tolerance).sum(axis=1)))
-    free = free @ turns[least][:, energies[least] <= tolerance]
-    return [words(mode, d[worst]) for mode in free.T]
+def _without_rotations(
+    null: Array, d: Array, keep: list[int], n_u: int, n: int, dim: int
+) -> Array:  # fmt: skip
+    """Null modes (scaled, orthonormal) but those that objectivity demands (Korn).
+
+    Rigid rotations: skw U alone, or together with the ν that turns with the body.
+    """
+    unit, size = np.eye(len(keep)) / d, min(n_u, dim)
+    at = {index: row for row, index in enumerate(keep)}
+    deformed, turned = [], [np.zeros(len(keep))]
+    for i, j in itertools.product(range(n), range(dim)):
+        own, other = unit[at[3 * i + j]], unit[at[3 * j + i]] if max(i, j) < size else 0.0
+        deformed.append(own + other)
+        if max(i, j) < size:
+            turned.append(own - other)
+    rows = [np.array(part) @ null for part in (deformed, turned)]
+    scales = [np.linalg.norm(part, axis=1)[:, None] for part in (deformed, turned)]
+    rows = [row / np.where(scale > 0, scale, 1.0) for row, scale in zip(rows, scales, strict=True)]
+    rigid = _kernel(rows[0])
+    # Of these, a ν alone that costs nothing is no rotation.
+    rotation = rigid @ _kernel(_kernel(rows[1] @ rigid).T)
+    return null @ _kernel(rotation.T)
+
+
+def _kernel(rows: Array) -> Array:
+    """Orthonormal columns that rows of length about one take to zero."""
+    _, sizes, right = np.linalg.svd(rows, full_matrices=True)
+    return right[np.count_nonzero(sizes > 1e-6) :].T
 
 
 def _held(modes: Array, hessian: Array, outer: Array, n_u: int, k: int) -> Array:
@@ -103,14 +152,14 @@ def _held(modes: Array, hessian: Array, outer: Array, n_u: int, k: int) -> Array
     n, first = n_u + k, 3 * (n_u + k) + n_u
     nu, U = slice(first, first + k), slice(0, 3 * n_u)
     own = modes[nu].T @ outer @ modes[nu]
-    relaxed = np.linalg.pinv(hessian[U, U], 1e-11, hermitian=True)
+    relaxed = np.linalg.pinv(hessian[U, U], NULL, hermitian=True)
     still = hessian[nu, nu] + outer - hessian[nu, U] @ relaxed @ hessian[U, nu]
     scale = np.sqrt(np.abs(np.diag(hessian[nu, nu] + outer)))
     if not scale.any():
         return own
     inverse = np.where(scale > 0, 1 / np.where(scale > 0, scale, 1.0), 0.0)
     values, vectors = np.linalg.eigh(inverse[:, None] * still * inverse)
-    stable = vectors[:, values > 1e-11].T * scale
+    stable = vectors[:, values > NULL].T * scale
     for j in range(3):
         part = stable @ modes[3 * n_u + j : 3 * n : 3]
         size = np.abs(part).max(initial=0.0)
@@ -154,6 +203,6 @@ def locking_ratio(hessian: Array, n_u: int, dim: int) -> float:
     volume = np.eye(dim).ravel() / np.sqrt(dim)
     kappa = np.einsum("i,mij,j->m", volume, block, volume)
     least = np.linalg.eigvalsh(basis.T @ block @ basis)[:, 0]
-    solid = least > 1e-11 * np.abs(kappa)
+    solid = least > NULL * np.abs(kappa)
     ratios = 2.0 / dim * (kappa[solid] / least[solid] - 1.0)
     return float(ratios.max(initial=0.0))

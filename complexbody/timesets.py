@@ -146,8 +146,8 @@ class _Region:
         if not np.any(self.s) and (not np.any(self.d) or scheme == "symmetric"):
             with np.errstate(divide="ignore"):
                 return 2.0 / np.sqrt(np.maximum(self.eigenvalues(h, scheme), 0.0))
-        # h² λ(h) grows like a power of h between 1 and 2, which √ratio finds in a few steps; beside a
-        # stiff self-action (s) it hardly grows at all: then by bisection. Both in log scale.
+        # h² λ(h) grows like a power of h between 1 and 2, which √ratio finds in a few steps; beside
+        # a stiff self-action (s) it hardly grows at all: then by bisection. Both in log scale.
         low, done = np.zeros_like(h), np.zeros(h.shape, dtype=bool)
         high, broken = np.full_like(h, np.inf), np.zeros(h.shape, np.bool_)
         for count in range(80):

@@ -12,7 +12,7 @@ from harness import bent, everywhere, refused
 
 import complexbody as cb
 from complexbody import _compat
-from complexbody.coercivity import check_coercive, locking_ratio
+from complexbody.coercivity import check_coercive, least_eigenvalue, locking_ratio
 from complexbody.errors import CoercivityError
 from complexbody.forms.two_field import _energy as two_field
 from complexbody.hessian import read
@@ -45,6 +45,28 @@ def test_rotations_are_no_news(comm):
             mesh, lambda U, nu, N: ufl.inner(ufl.sym(U), ufl.sym(U)) + ufl.inner(N, N), 3, 2
         )
         assert modes == []
+
+
+def test_a_descriptor_may_turn_with_the_body(comm):
+    """Cosserat: a rotation with ν = ½ curl u is rigid. A ν that no rotation needs is told."""
+    for cells in ((3, 2), (2, 2, 2)):
+        mesh, k = bent(comm, cells), 3 if len(cells) == 3 else 1
+
+        def energy(U, nu, N, k=k):
+            turns = [U[1, 0] - U[0, 1], U[2, 1] - U[1, 2], U[0, 2] - U[2, 0]]
+            relative = sum((0.5 * turns[i] - nu[i]) ** 2 for i in range(k))
+            strain = ufl.inner(ufl.sym(U), ufl.sym(U))
+            return strain + 1e-6 * relative + 1e4 * ufl.inner(N, N)
+
+        assert coercive(mesh, energy, 3, k) == []
+        assert 1e-3 < least_eigenvalue(dense(mesh, energy, 3, k), 3, k, len(cells)) < 1
+
+    def even(U, nu, N):
+        strain = ufl.inner(ufl.sym(U), ufl.sym(U))
+        return strain + (nu[0] - nu[1]) ** 2 + ufl.inner(N, N)
+
+    assert coercive(mesh, even, 3, 2) in (["+1 nu1 +1 nu2"], ["+1 nu2 +1 nu1"])
+    assert abs(least_eigenvalue(dense(mesh, even, 3, 2), 3, 2, 3)) < 1e-14
 
 
 def test_null_modes_are_told(cube):

@@ -76,7 +76,7 @@ def frequency_error(method, delta):
 def test_no_worse_towards_the_edge(name):
     """The error at δ = 1e-2, 1e-4, 1e-6 is the mesh's, whatever the method: no trace of 1/δ."""
     found = np.array([frequency_error(METHODS[name], 10.0**-p) for p in (2, 4, 6)])
-    assert found == pytest.approx(-1.4125e-3, rel=0.01)  # (πL)²/24 of the mean square cell: 1e-3
+    assert found == pytest.approx(-1.4125e-3, rel=0.01)  # -(π/20)²/24 = -1.03e-3 if uniform
     assert found[1:] == pytest.approx(found[-1], rel=1e-3)
 
 
