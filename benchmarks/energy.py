@@ -45,6 +45,7 @@ METHODS: dict[str, tuple[float, Callable[[float, float], Any], str]] = {
     "AVI, balanced windows": (0.45, lambda a, _: AVI(a), "#c2185b"),
     "LocalLeapfrog": (0.9, lambda a, _: LocalLeapfrog(a), "#111111"),
 }
+OURS = tuple(METHODS)
 if hasattr(cb, "PetscTS"):
     METHODS |= {
         "PetscTS alpha2": (0.9, lambda a, h: cb.PetscTS("alpha2", a * h), "#8e6bbf"),
@@ -149,7 +150,8 @@ def measure(name: str, periods: float, looks: int, fractions: tuple[float, ...])
         modes, critical = Modes(problem), critical_step(problem)
         problem.close()
         for method, (usual, maker, _) in METHODS.items():
-            for fraction in fractions:
+            # PETSc's run Python at every step: without the smallest ones.
+            for fraction in fractions if method in OURS else fractions[:-1]:
                 alpha = usual * fraction
                 given = makers[data](make(cells))
                 found = follow(given, maker(alpha, critical), modes, periods * modes.period, looks)
@@ -206,19 +208,21 @@ def draw(found: dict[str, Any], path: Path) -> None:
             ax.set_xticks(fractions, [f"{f:.3g}" for f in fractions])
             ax.minorticks_off()
             ax.margins(x=0.08)
+        axes[row, 1].set_ylim(bottom=1e-3)
     for ax in axes.flat:
         ax.grid(True, lw=0.4, color="0.9")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, ncols=min(6, len(labels)), loc="upper center", frameon=False)
+    figure.legend(handles, labels, ncols=min(5, len(labels)), loc="upper center", frameon=False)
     figure.text(0.01, 0.008, CAPTION, color="0.35")
-    figure.tight_layout(rect=(0, 0.03, 1, 0.94 if len(labels) < 7 else 0.91))
+    figure.tight_layout(rect=(0, 0.045, 1, 0.95 if len(labels) < 7 else 0.92))
     figure.savefig(path, dpi=150)
     plt.close(figure)
 
 
 CAPTION = (
     "Random positions at all nodes, from rest; no dissipation. ×: energy grew a hundredfold, the "
-    "run was ended. Reference: exact motion of the same semi-discrete equations."
+    "run was ended. Reference: exact motion of the same semi-discrete equations.\nNewmark and alpha2 "
+    "keep the energy of linear scenes to the tolerance of their solvers: below the middle panels."
 )
 
 
