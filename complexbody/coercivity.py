@@ -34,7 +34,7 @@ def check_coercive(
         dim: Dimension of the mesh: other columns of U and N do not exist.
         name: The body's name, for messages.
         outer: ∂²(ρw)/∂ν∂ν of the potential, shape (samples, k, k), if there is one. It holds null
-            modes of e, but never makes up for a negative e.
+            modes of e, but never makes up for a negative e. Without samples no mode is told.
 
     Returns:
         The null modes that nothing holds but inertia and boundary data, in words: rigid rotations
@@ -69,7 +69,9 @@ def check_coercive(
         return []
     full = np.zeros((len(labels), free.shape[1]))
     full[keep] = free / d[worst][:, None]
-    own = np.zeros((1, k, k)) if outer is None or not len(outer) else outer
+    own = np.zeros((1, k, k)) if outer is None else outer
+    if not len(own):
+        return []  # no cells here: others tell
     held = np.array([_held(full, hessian[worst], w, n_u, k) for w in own])
     energies, turns = np.linalg.eigh(held)
     least = int(np.argmin((energies > NULL).sum(axis=1)))
