@@ -151,10 +151,11 @@ class _Region:
         if scheme == HELD or constant:
             with np.errstate(divide="ignore"):
                 return 2.0 / np.sqrt(np.maximum(self.eigenvalues(h, scheme), 0.0))
-        # h² λ(h) grows like a power of h between 1 and 2; bracket it from below in log scale.
+        # h² λ(h) grows like a power of h between 1 and 2, which √ratio finds in a few steps; beside
+        # a stiff self-action (s) it hardly grows at all: then by bisection. Both in log scale.
         low, done = np.zeros_like(h), np.zeros(h.shape, dtype=bool)
-        broken = np.zeros(h.shape, np.bool_)
-        for _ in range(60):
+        high, broken = np.full_like(h, np.inf), np.zeros(h.shape, np.bool_)
+        for count in range(80):
             values = self.eigenvalues(h, scheme)
             broken |= np.isnan(values)
             if np.any(broken):
@@ -163,9 +164,13 @@ class _Region:
                 ratio = 4.0 / (h * h * np.maximum(values, 1e-300))
             good = ratio >= 1.0
             low = np.where(good & ~done, np.maximum(low, h), low)
+            high = np.where(good | done, high, np.minimum(high, h))
             unlimited = ratio > 1e200
             # √ratio overshoots upwards and is safe downwards when λ falls with h.
             change = np.where(good, np.sqrt(np.minimum(ratio, 1e12)), np.maximum(ratio, 1e-12))
+            if count >= 12 and np.any(self.s):
+                middle = np.sqrt(low * np.where(np.isinf(high), 16 * low, high)) / h
+                change = np.where(low > 0, middle, change)
             change = np.where(unlimited, 1.0, change)
             # Each cell stops by itself: its step must not depend on who else is on this rank.
             done |= (np.abs(change - 1) < 1e-7) & (good | unlimited)

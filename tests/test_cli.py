@@ -566,6 +566,20 @@ DEFAULTS = {}
     assert f"factor of {200 / 29:.3g} at most" in out
 
 
+def test_check_tells_of_locking(bar, call):
+    text = """
+def scene(comm, lam=60.0):
+    mesh = meshes.rectangle(comm, (0, 0), (1, 1), 4)
+    return cb.Scene(mesh, isotropic_two_field(d=2, lam=lam))
+DEFAULTS = {}
+"""
+    code, out, err = call("check", bar(text), "--set", "lam=60")
+    assert (code, err) == (0, "")
+    assert "coercive (A1), smallest relative eigenvalue" in flat(out)
+    assert "is nearly incompressible: volume changes cost as much as with λ/μ = 60" in flat(out)
+    assert "incompressible" not in flat(call("check", bar(text), "--set", "lam=40")[1])
+
+
 def test_check_tells_bodies_apart(bar, call):
     text = """
 import ufl
