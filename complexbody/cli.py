@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from mpi4py import MPI
 
-from complexbody import __version__, cli_plan, commands
+from complexbody import __version__, cli_plan, cli_stability, commands
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
 from complexbody.integrators.petsc_ts import FORMS
@@ -124,6 +124,7 @@ def parser() -> argparse.ArgumentParser:
     planned = command("plan", cli_plan.command, cli_plan.TEXT)
     _scene(planned)
     _integrator(planned)
+    cli_stability.declare(command)
     command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
     return main
 

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Maps of one step or window as matrices, by running it from unit states, and their growth."""
 
-import itertools
-
 import numpy as np
 from dense import halves, prepared
 from mpi4py import MPI
 
 import complexbody as cb
-from complexbody import meshes, native
-from complexbody.integrators.balance import BEGIN
+from complexbody import meshes
+from complexbody.growth import RunMap
 
 EVERYWHERE = lambda x: x[0] > -1  # noqa: E731
 
@@ -41,60 +39,13 @@ def frequencies(problem, modes=False):
 
 
 def window_map(run):
-    """The matrix of one window on (q, q̇) of the free components and, balanced, the held forces.
-
-    A cell's forces are those of some displacement of its nodes: of all others it never holds any.
-    """
-    problem, balance = run.problem, run.balance
-    disc, n, record = problem.disc, problem.disc.n, problem.disc.record
-    rows, columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
-    size, held = len(rows), []
-    if balance is not None:
-        for block, lane in np.argwhere(disc.source_cell >= 0):
-            held += [(block, lane, basis) for basis in force_basis(run, block, lane)]
-
-    def put(q, v, F):
-        run.record[:-1, :n] = run.record[:-1, record : record + n] = 0.0
-        run.record[rows, columns], run.record[rows, record + columns] = q, v
-        run.record[:, run._time] = run.time
-        if balance is not None:
-            balance.held[:], total = 0.0, np.zeros((disc.nodes + 1, record))
-            run.record[:-1, 2 * record : 2 * record + n] = 0.0
-            for (block, lane, basis), part in zip(held, F, strict=True):
-                if part:
-                    balance.held[block, :, lane] += part * basis
-                    np.add.at(total[:, :n], disc.cells[block, :, lane], part * basis.reshape(-1, n))
-            run.c.cb_accelerate(run._world, native.pointer(total))
-
-    out = np.zeros((2 * size + len(held),) * 2)
-    for j, unit in enumerate(np.eye(len(out))):
-        run.steps = 1
-        put(unit[:size], unit[size : 2 * size], unit[2 * size :])
-        run.advance(1)
-        out[:size, j] = run.record[rows, columns]
-        out[size : 2 * size, j] = run.record[rows, record + columns]
-        out[2 * size :, j] = [balance.held[m, :, lane] @ basis for m, lane, basis in held]
-    return out
-
-
-def force_basis(run, block, lane):
-    """Orthonormal forces that a cell can hold, shape (rank, (d+1)·n)."""
-    disc, balance, rows = run.problem.disc, run.balance, []
-    nodes, n = disc.cells[block, :, lane], disc.n
-    group = next(i for i in range(run.plan.count) if block < run.plan.groups[i].last)
-    for a, i in itertools.product(nodes, range(n)):
-        run.record[:-1, :n] = 0.0
-        run.record[a, i] = 1.0
-        run.record[:, run._time] = run.time
-        run._together(run.time, BEGIN, first=group, last=group + 1)
-        rows.append(balance.held[block, :, lane].copy())
-    values, basis = np.linalg.svd(rows)[1:]
-    return basis[: np.count_nonzero(values > 1e-10 * values[0])]
+    """The matrix of one window on (q, q̇) of the free components and, balanced, the held forces."""
+    return RunMap(run).matrix()
 
 
 def radius(run):
     """Spectral radius of the window map."""
-    return abs(np.linalg.eigvals(window_map(run))).max()
+    return RunMap(run).radius()
 
 
 def spectral_radius(scene, method):
