@@ -649,7 +649,7 @@ def test_help(call):
     assert call("--version") == (0, f"complexbody {cb.__version__}\n", "")
     for command in OPTIONS:
         assert re.search(rf"^    {command}\s", out, re.M)
-    for later in ("plan", "chart", "resume"):
+    for later in ("chart", "resume"):
         assert f"    {later} " not in out
 
 
