@@ -19,6 +19,7 @@ from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
 from complexbody.simulate import simulate
+from complexbody.workprecision import Chart, chart
 
 __version__ = "0.1.0"
 
@@ -26,6 +27,7 @@ __all__ = [
     "AVI",
     "Body",
     "BodyForce",
+    "Chart",
     "ComplexBodyError",
     "Fix",
     "Implicit",
@@ -37,6 +39,7 @@ __all__ = [
     "Scene",
     "Synchronous",
     "Traction",
+    "chart",
     "constant",
     "ramp",
     "realised_speed_up",

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from mpi4py import MPI
 
-from complexbody import __version__, commands
+from complexbody import __version__, cli_chart, commands
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
 from complexbody.masses import SCHEMES
@@ -42,6 +42,7 @@ examples:
   complexbody run demos/impact.py                 as the file says
   complexbody run demos/impact.py --set cells=80 --until 2e-5 --out results/fine
   mpirun -n 4 complexbody run demos/impact.py     the same on four processes
+  complexbody chart demos/graded_crack.py         which method is the cheapest for which error?
   complexbody info                                versions, compiler, what is missing
 
 a scene file is a Python file with
@@ -119,6 +120,7 @@ def parser() -> argparse.ArgumentParser:
     )  # fmt: skip
     _scene(check)
     _integrator(check)
+    cli_chart.add(command, _scene)
     command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
     return main
 

@@ -3,7 +3,8 @@
 
 A scene file has ``def scene(comm, **parameters) -> cb.Scene`` and, if it likes, ``DEFAULTS`` (a
 dict of :data:`SETTINGS`), ``check(result) -> str``, which raises AssertionError if the physics is
-wrong, and ``picture(result, path)``. All three functions are called on all ranks.
+wrong, and ``picture(result, path)``; for charts, ``exact(t, **parameters)``, a dict with some of u,
+nu, u_dot, nu_dot at t, functions of x (3, npts). All are called on all ranks.
 """
 
 from __future__ import annotations
@@ -177,6 +178,23 @@ class SceneFile:
                 "ranks. Make it with the comm it is given."
             )
         return made
+
+    @property
+    def source(self) -> bytes:
+        """The file's content."""
+        return self._source
+
+    def exact(self, t: float, parameters: Mapping[str, Any]) -> Any:
+        """What the file's ``exact(t, …)`` says, given those of the parameters that it takes.
+
+        Raises:
+            CommandError: naming file, line and exception.
+        """
+        known = inspect.signature(self.module.exact).parameters
+        anything = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
+        taken = {n: v for n, v in parameters.items() if anything or n in known}
+        with self._blamed("exact()"):
+            return self.module.exact(t, **taken)
 
     def has(self, name: str) -> bool:
         """Whether the file has a function ``name``."""
