@@ -117,7 +117,9 @@ def chart(a: argparse.Namespace, ranks: Any) -> None:
                 file.complete({**parameters, name: value})
         until = a.until if a.until is not None else file.defaults.get("until")
         if until is None:
-            raise CommandError(f"Nothing says when to stop. Give --until T, or DEFAULTS in {a.file}.")
+            raise CommandError(
+                f"Nothing says when to stop. Give --until T, or DEFAULTS in {a.file}."
+            )
         steps = _steps(a.steps)
     out = Path(a.out or Path("results") / f"chart-{file.path.stem}")
 
@@ -134,8 +136,9 @@ def chart(a: argparse.Namespace, ranks: Any) -> None:
     if a.quiet:
         return
     for kind in fronts.ERRORS:
-        if fronts.decades(found.of(kind), "seconds", kind, a.norm):
-            say(ranks, "", f"The cheapest method by {kind} error ({a.norm}):", found.table(error=kind))
+        if found.knows(kind):
+            head = f"The cheapest method by {kind} error ({a.norm}):"
+            say(ranks, "", head, found.table(error=kind))
     if found.error == "time":
         say(ranks, "", "No total error: one mesh and no exact solution.")
     say(ranks, "", f"files {out}")

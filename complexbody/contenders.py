@@ -54,11 +54,12 @@ class Contender:
         return [self.limit / self.ratio**i for i in range(count)]
 
 
-def _peer(kind: str, *arguments: Any, **options: Any) -> Make:
-    """A peer by the name of its class, with its step last."""
+def _peer(kind: str, *arguments: Any, own: bool = False, **options: Any) -> Make:
+    """A peer by the name of its class; ``own``: its steps are factors of a limit of its own."""
 
     def make(factor: float, step: float) -> Any:
-        return getattr(complexbody, kind)(*arguments, step=step, **options)
+        steps = {"safety": factor} if own else {"step": step}
+        return getattr(complexbody, kind)(*arguments, **steps, **options)
 
     return make
 
@@ -95,7 +96,7 @@ _OURS = (
 )  # fmt: skip
 
 #: Implicit peers: from far above the stable limit, where a large step must pay for its solve.
-_ABOVE = {"limit": 64.0, "ratio": 4.0, "peer": True}
+_FAR, _RATIO = 64.0, 4.0
 _PEERS = (
     Contender(
         "assembly", "leapfrog, dolfinx assembly", _peer("AssembledLeapfrog", force="assembly"),
@@ -106,19 +107,20 @@ _PEERS = (
         peer=True, colour="#009E73", line="--", marker="s",
     ),
     Contender(
-        "petsc-rk4", "PETSc TS, Runge–Kutta 4", _peer("PetscTS", "rk4"), 1.2,
+        "petsc-rk4", "PETSc TS, Runge–Kutta 4", _peer("PetscTS", "rk4", own=True),
         peer=True, colour="#332288", line="--", marker="D",
     ),
     Contender(
-        "petsc-alpha2", "PETSc TS, generalised α", _peer("PetscTS", "alpha2"), **_ABOVE,
-        colour="#AA4499", line="--", marker="^",
+        "petsc-alpha2", "PETSc TS, generalised α", _peer("PetscTS", "alpha2"), _FAR, _RATIO,
+        peer=True, colour="#AA4499", line="--", marker="^",
     ),
     Contender(
-        "petsc-cn", "PETSc TS, Crank–Nicolson", _peer("PetscTS", "cn"), **_ABOVE,
-        colour="#882255", line="--", marker="v",
+        "petsc-cn", "PETSc TS, Crank–Nicolson", _peer("PetscTS", "cn"), _FAR, _RATIO,
+        peer=True, colour="#882255", line="--", marker="v",
     ),
     Contender(
-        "newmark", "Newmark", _peer("Newmark"), **_ABOVE, colour="#44AA99", line="--", marker="P",
+        "newmark", "Newmark", _peer("Newmark"), _FAR, _RATIO,
+        peer=True, colour="#44AA99", line="--", marker="P",
     ),
 )  # fmt: skip
 _NEEDS = {"assembly": "AssembledLeapfrog", "matrix": "AssembledLeapfrog", "newmark": "Newmark"}

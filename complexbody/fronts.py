@@ -67,13 +67,21 @@ def by_method(rows: Iterable[Row]) -> dict[str, list[Row]]:
 def decades(
     rows: Iterable[Row], cost: str = "seconds", error: str = "total", norm: str = "fields"
 ) -> list[float]:
-    """Powers of ten from the largest error of any front down to the smallest one reached."""
+    """Errors at which methods are compared: powers of ten, from the largest error of any front on.
+
+    Down to the smallest error that any reaches; where that holds one decade at most also halfway
+    between them, at √10 times a power of ten.
+    """
     fronts = [front(points(own, cost, error, norm)) for own in by_method(rows).values()]
     errors = [y for f in fronts for _, y in f]
     if not errors:
         return []
     first, last = (math.log10(v) for v in (max(errors), min(errors)))
-    return [10.0**k for k in range(math.floor(first), math.ceil(last - 1e-12) - 1, -1)]
+    for part in (1, 2):
+        down = range(math.floor(part * first), math.ceil(part * last - 1e-12) - 1, -1)
+        if len(down) > 1 or part == 2:
+            break
+    return [10.0 ** (k / part) for k in down]
 
 
 def winners(
@@ -86,7 +94,8 @@ def winners(
         winner is one of the peers; ``second`` and ``margin``, its cost over the winner's (None if
         no other reaches the error); ``best_own``, ``best_peer`` and ``over_peer``, the cost of the
         best peer over that of the best of ours: below 1 where a peer is cheaper (None if one of
-        the two is missing); ``open``: the winner's cheapest point is already as accurate.
+        the two is missing); ``open``: the winner's cheapest point is already as accurate;
+        ``short``: methods that stop above the error at a smaller cost: a smaller step might win.
     """
     rows = list(rows)
     methods = by_method(rows)
@@ -109,22 +118,26 @@ def winners(
             "best_peer": peer[1] if peer else None,
             "over_peer": peer[0] / own[0] if peer and own else None,
             "open": level >= fronts[winner][0][1],
+            "short": [n for n, f in fronts.items() if f and f[-1][1] > level and f[-1][0] < least],
         })  # fmt: skip
     return out
 
 
 def table(found: Sequence[Mapping[str, Any]], unit: str = "s") -> str:
-    """Winners as text."""
+    """Winners as text: "over peer" is the best peer's cost over that of the best of ours."""
     if not found:
         return "no method ran to an error that is known"
-    head = ("error", "cheapest", f"cost [{unit}]", "second", "margin", "best peer", "over peer")
+    head = (
+        "error", "cheapest", f"cost [{unit}]", "second", "margin", "best peer", "over peer",
+        "not run as far",
+    )  # fmt: skip
     lines = [head]
     for w in found:
         lines.append((
-            f"{w['error']:.0e}", w["winner"] + (" (peer)" if w["peer"] else ""),
+            f"{w['error']:.1e}".replace(".0e", "e"), w["winner"] + (" (peer)" if w["peer"] else ""),
             f"{w['cost']:.3g}" + (" or less" if w["open"] else ""), w["second"] or "none",
             "" if w["margin"] is None else f"{w['margin']:.2f}", w["best_peer"] or "none",
-            "" if w["over_peer"] is None else f"{w['over_peer']:.2f}",
+            "" if w["over_peer"] is None else f"{w['over_peer']:.2f}", ", ".join(w["short"]),
         ))  # fmt: skip
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
     rows = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in lines]

@@ -26,6 +26,8 @@ from complexbody.references import Reference, Semidiscrete, quietly
 HUGE, LOST = 1e3, 10.0
 #: A run is looked at after so many steps, or at so many times; steps of the run that is discarded.
 STRIDE, PIECES, WARM = 64, 16, 3
+#: A run is left out as too long after this share of the budget.
+SURE = 0.02
 
 
 class _BlownUp(Exception):
@@ -117,15 +119,21 @@ class Point:
 
     def _warm(self, run: Run, row: dict[str, Any]) -> bool:
         """A run that is discarded; False if a whole one would take longer than the budget."""
-        few, cost = min(WARM, row["steps"]), _Cost()
+        cost, steps = _Cost(), row["steps"]
         self._advance(run, 1, _Cost())
-        if few > 1:
-            self._advance(run, few - 1, cost)
+        few, whole = min(WARM, steps) - 1, 0.0
+        while few > 0:
+            self._advance(run, few, cost)
+            cost.done = run.steps - 1
+            wall = self.comm.bcast(cost.wall)
+            whole = wall / cost.done * steps
+            if whole <= self.budget or wall > SURE * self.budget:
+                break
+            few = min(2 * few, steps - run.steps)  # a few steps alone may mislead
         run.close()
-        whole = self.comm.bcast(cost.wall) / max(few - 1, 1) * row["steps"]
         if whole > self.budget:
             row.update(
-                status="too long", seconds=cost.seconds / (few - 1) * row["steps"],
+                status="too long", seconds=cost.seconds / cost.done * steps,
                 message=f"about {whole:.0f} s, more than the budget of {self.budget:g} s",
             )  # fmt: skip
         return whole <= self.budget

@@ -112,7 +112,9 @@ class Semidiscrete:
         problem.close()
         self._row, self.level = row, self.level + 1
         if len(row) > 1:
-            self.estimate = self.norms.errors(row[-1], row[-2])
+            found = self.norms.errors(row[-1], row[-2])
+            # Round-off of thousands of steps is in both.
+            self.estimate = {n: None if e is None else max(e, FLOOR) for n, e in found.items()}
 
     def state(self, mesh: Any = None) -> State:
         """T_{i,i}, on the nodes of the scene's own mesh."""
@@ -189,7 +191,7 @@ class Exact:
 
     def about(self) -> dict[str, Any]:
         """That it is exact."""
-        return {"kind": "exact solution of the scene"}
+        return {"kind": "the exact solution"}
 
     def close(self) -> None:
         """Nothing to free."""
@@ -230,7 +232,7 @@ class Finer:
 
     def about(self) -> dict[str, Any]:
         """Which mesh, and what its own time steps leave."""
-        return {**self.fine.about(), "kind": f"the same on the mesh {self._label}, interpolated"}
+        return {**self.fine.about(), "kind": f"the mesh with {self._label}"}
 
     def close(self) -> None:
         """Free what it holds."""

@@ -59,7 +59,11 @@ class Chart:
     @property
     def error(self) -> str:
         """"total" if any total error is known, else "time"."""
-        return "total" if fronts.decades(self.rows, "seconds", "total", self.norm) else "time"
+        return "total" if self.knows("total") else "time"
+
+    def knows(self, error: str) -> bool:
+        """Whether any point has this error, "total" or "time"."""
+        return bool(fronts.points(self.of(error), "seconds", error, self.norm))
 
     def winners(
         self, cost: str = "seconds", error: str | None = None, norm: str | None = None
@@ -145,7 +149,8 @@ def chart(
     }  # fmt: skip
     file = ChartFile(comm, None if out is None else Path(out), identity, fresh)
     file.write(
-        machine=machine.machine(), versions=machine.versions(), commit=machine.commit(),
+        until=float(until), machine=machine.machine(), versions=machine.versions(),
+        commit=machine.commit(),
         settings={
             "methods": None if methods is None else [getattr(m, "key", m) for m in methods],
             "steps": steps, "meshes": plan.meshes, "repeats": repeats, "budget": budget,
@@ -155,7 +160,7 @@ def chart(
     keys = _Runner(plan, file, repeats, budget, tell or (lambda line: None)).run(methods)
     made = Chart([file.rows[k] for k in keys], file.head, file.references, norm, file.path)
     wins = {kind: made.winners(error=kind) for kind in fronts.ERRORS}
-    file.write(title=plan.title, winners=wins)
+    file.write(title=plan.title, dimension=plan.dimension, winners=wins)
     if file.path is not None:
         on_first_rank(comm, file.path, lambda: made.save(file.path.parent))  # type: ignore[union-attr]
     return made
@@ -169,7 +174,8 @@ class _Plan:
         comm: Any, steps: Any, repeats: int, norm: str,
     ) -> None:  # fmt: skip
         self.scene_, self.until, self.comm, self.exact = scene, float(until), comm, exact
-        self.parameters, self.steps, self.title = dict(parameters), steps, ""
+        self.parameters, self.steps = dict(parameters), steps
+        self.title, self.dimension = "", 0
         factory = not isinstance(scene, Scene)
         wrong = ""
         if not (np.isfinite(until) and until > 0):
@@ -178,9 +184,7 @@ class _Plan:
             wrong = "meshes need a function that makes the scene. Give that, not a scene"
         elif meshes is not None and (len(meshes) != 1 or not all(len(v) for v in meshes.values())):
             wrong = f"meshes are {dict(meshes)!r}. Give one parameter and its values"
-        elif isinstance(steps, int) and steps < 1 or not isinstance(steps, int | None) and not (
-            len(steps) and all(np.isfinite(s) and s > 0 for s in steps)
-        ):  # fmt: skip
+        elif not _sensible(steps):
             wrong = f"steps are {steps!r}. Give how many, or positive factors"
         elif repeats < 1:
             wrong = f"repeats is {repeats}. Give 1 or more"
@@ -205,7 +209,7 @@ class _Plan:
             made = self.scene_
         else:
             made = self.scene_(self.comm, **{**self.parameters, **mesh})
-        self.title = made.name
+        self.title, self.dimension = made.name, made.mesh.geometry.dim
         return made
 
     def digest(self, source: str | bytes | None) -> str:
@@ -231,6 +235,12 @@ class _Plan:
         return Finer(self.scene(finer), self.until, level, label(finer))
 
 
+def _sensible(steps: Any) -> bool:
+    if isinstance(steps, int | None):
+        return steps is None or steps > 0
+    return len(steps) > 0 and all(np.isfinite(s) and s > 0 for s in steps)
+
+
 def label(mesh: Mapping[str, Any]) -> str:
     """A mesh in words."""
     return ", ".join(f"{k}={v}" for k, v in mesh.items()) or "the scene's"
@@ -245,6 +255,7 @@ class _Runner:
         self.plan, self.file, self.repeats, self.budget = plan, file, repeats, budget
         self.tell, self.comm = tell, plan.comm
         self.total: Reference | None = None
+        self.commit = file.head["commit"]
 
     def run(self, methods: Any) -> list[str]:
         """All points, mesh by mesh; their keys."""
@@ -282,7 +293,7 @@ class _Runner:
             found = Point(contender, factor, reference, self.total, self.repeats, self.budget)
             row = {
                 "key": key, "method": contender.name, "peer": contender.peer, "mesh": dict(mesh),
-                "factor": factor, "ranks": self.comm.size, "commit": machine.commit(),
+                "factor": factor, "ranks": self.comm.size, "commit": self.commit,
                 **found.measure(),
             }  # fmt: skip
             self.file.references[name] = reference.about()
