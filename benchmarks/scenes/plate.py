@@ -15,11 +15,11 @@ import complexbody as cb
 from complexbody.forms import scaled_icosahedral_quasicrystal
 from complexbody.meshes import Side, notched_plate
 
-DEFAULTS = {"until": 0.8}
+DEFAULTS = {"until": 1.2}
 
 
 def scene(
-    comm: Any, refine: float = 0.3, grading: float = 32.0, frequency: float = 2.0,
+    comm: Any, refine: float = 0.3, grading: float = 32.0, frequency: float = 1.2,
     thickness: float = 0.06,
 ) -> cb.Scene:  # fmt: skip
     """The plate, 1.6 × 1 with a notch of length 0.6 from the left.
