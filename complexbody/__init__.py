@@ -13,6 +13,7 @@ from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
+from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
 from complexbody.precheck import realised_speed_up
@@ -25,6 +26,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AVI",
+    "AssembledLeapfrog",
     "Body",
     "BodyForce",
     "Chart",
@@ -33,7 +35,9 @@ __all__ = [
     "Implicit",
     "Initial",
     "LocalLeapfrog",
+    "Newmark",
     "Output",
+    "PetscTS",
     "Pressure",
     "Result",
     "Scene",

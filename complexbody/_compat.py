@@ -299,10 +299,15 @@ def exterior_facets(domain: mesh.Mesh) -> Ints:
     return np.flatnonzero(touching.array[: points.size_local] == 1).astype(np.int32)
 
 
-def accumulate(function: fem.Function) -> None:
-    """Add what ghosts hold to their owners, then give all copies the owners' values."""
+def add_ghosts(function: fem.Function) -> None:
+    """Add what ghosts hold to their owners; ghosts keep what they hold."""
     mode = la.ScatterMode.add if hasattr(la, "ScatterMode") else la.InsertMode.add
     function.x.scatter_reverse(mode)
+
+
+def accumulate(function: fem.Function) -> None:
+    """Add what ghosts hold to their owners, then give all copies the owners' values."""
+    add_ghosts(function)
     function.x.scatter_forward()
 
 

@@ -22,6 +22,7 @@ from mpi4py import MPI
 from complexbody import __version__, cli_chart, commands
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
+from complexbody.integrators.petsc_ts import FORMS
 from complexbody.masses import SCHEMES
 from complexbody.output import CELL_FIELDS, NODE_FIELDS, STEP_FIELDS
 from complexbody.together import (
@@ -186,14 +187,23 @@ def _integrator(to: argparse.ArgumentParser) -> None:
         help="implicit: a Newton at each node (default), or SNES with χ integrated in full",
     )  # fmt: skip
     group.add_argument(
-        "--tolerance", metavar="EPS", type=float, help="implicit: of the residual; default 1e-12"
+        "--tolerance", metavar="EPS", type=float,
+        help="implicit, newmark, petsc-ts: of the residual; default 1e-12, 1e-10, 1e-10",
     )
     group.add_argument(
         "--monitor", action="store_true", default=None, help="implicit: print SNES's residuals"
     )
     group.add_argument(
         "--petsc", metavar="NAME=VALUE", action="append", default=[],
-        help="implicit: a PETSc option of SNES, such as ksp_type=gmres; repeatable",
+        help="implicit, newmark, petsc-ts: a PETSc option, such as ksp_type=gmres; repeatable",
+    )  # fmt: skip
+    group.add_argument(
+        "--force", choices=("assembly", "matrix"),
+        help="assembled-leapfrog: assembled at each step (default), or a product",
+    )  # fmt: skip
+    group.add_argument(
+        "--kind", choices=tuple(FORMS),
+        help="petsc-ts: generalised-α (default), Runge–Kutta, trapezoidal or midpoint rule",
     )  # fmt: skip
     group.add_argument(
         "--levels", metavar="L", type=int,
