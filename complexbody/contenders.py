@@ -116,7 +116,7 @@ _PEERS = (
     ),
     Contender(
         "petsc-cn", "PETSc TS, Crank–Nicolson", _peer("PetscTS", "cn"), _FAR, _RATIO,
-        peer=True, colour="#882255", line="--", marker="v",
+        peer=True, colour="#999933", line="--", marker="v",
     ),
     Contender(
         "newmark", "Newmark", _peer("Newmark"), _FAR, _RATIO,

@@ -18,6 +18,8 @@ Row = Mapping[str, Any]
 #: Cost: processor seconds of stepping, or element updates. Error: which of a row's two.
 COSTS = ("seconds", "updates")
 ERRORS = ("total", "time")
+#: An error is smaller if it is this share of another at most.
+GAIN = 0.98
 #: Errors of a row: L2 (lumped) of each field, the larger of u and ν, energy norm, energy.
 NORMS = ("fields", "u", "nu", "u_dot", "nu_dot", "energy_norm", "energy")
 
@@ -35,10 +37,13 @@ def points(
 
 
 def front(found: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-    """The points that none of the others beats, by rising cost and falling error."""
+    """The points that none of the others beats, by rising cost and falling error.
+
+    An error less than 2 % smaller is no gain: there a method has reached the error of its mesh.
+    """
     out: list[tuple[float, float]] = []
     for cost, error in sorted(found):
-        if not out or error < out[-1][1]:
+        if not out or error < GAIN * out[-1][1]:
             out.append((cost, error))
     return out
 
@@ -67,10 +72,10 @@ def by_method(rows: Iterable[Row]) -> dict[str, list[Row]]:
 def decades(
     rows: Iterable[Row], cost: str = "seconds", error: str = "total", norm: str = "fields"
 ) -> list[float]:
-    """Errors at which methods are compared: powers of ten, from the largest error of any front on.
+    """Errors at which methods are compared: powers of ten below 1, from large to small.
 
-    Down to the smallest error that any reaches; where that holds one decade at most also halfway
-    between them, at √10 times a power of ten.
+    From the largest error of any front down to the smallest that any reaches; where that holds one
+    power of ten at most, also halfway between them.
     """
     fronts = [front(points(own, cost, error, norm)) for own in by_method(rows).values()]
     errors = [y for f in fronts for _, y in f]
@@ -78,7 +83,8 @@ def decades(
         return []
     first, last = (math.log10(v) for v in (max(errors), min(errors)))
     for part in (1, 2):
-        down = range(math.floor(part * first), math.ceil(part * last - 1e-12) - 1, -1)
+        top = min(math.floor(part * first), -1)
+        down = range(top, math.ceil(part * last - 1e-12) - 1, -1)
         if len(down) > 1 or part == 2:
             break
     return [10.0 ** (k / part) for k in down]
@@ -123,6 +129,10 @@ def winners(
     return out
 
 
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) < 3 else f"{names[0]} and {len(names) - 1} more"
+
+
 def table(found: Sequence[Mapping[str, Any]], unit: str = "s") -> str:
     """Winners as text: "over peer" is the best peer's cost over that of the best of ours."""
     if not found:
@@ -137,7 +147,7 @@ def table(found: Sequence[Mapping[str, Any]], unit: str = "s") -> str:
             f"{w['error']:.1e}".replace(".0e", "e"), w["winner"] + (" (peer)" if w["peer"] else ""),
             f"{w['cost']:.3g}" + (" or less" if w["open"] else ""), w["second"] or "none",
             "" if w["margin"] is None else f"{w['margin']:.2f}", w["best_peer"] or "none",
-            "" if w["over_peer"] is None else f"{w['over_peer']:.2f}", ", ".join(w["short"]),
+            "" if w["over_peer"] is None else f"{w['over_peer']:.2f}", _few(w["short"]),
         ))  # fmt: skip
     widths = [max(len(line[i]) for line in lines) for i in range(len(head))]
     rows = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in lines]

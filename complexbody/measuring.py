@@ -26,6 +26,8 @@ from complexbody.references import Reference, Semidiscrete, quietly
 HUGE, LOST = 1e3, 10.0
 #: A run is looked at after so many steps, or at so many times; steps of the run that is discarded.
 STRIDE, PIECES, WARM = 64, 16, 3
+#: Runs are repeated beyond what is asked for until all took so many seconds, up to so many times.
+SHORT, MORE = 0.1, 5
 #: A run is left out as too long after this share of the budget.
 SURE = 0.02
 
@@ -99,23 +101,29 @@ class Point:
         if not self._warm(run, row):
             return
         spent = 0.0
-        for number in range(self.repeats):
+        while True:
             run, cost = self._prepared(row), _Cost()
             try:
                 self._whole(run, row["steps"], cost)
             finally:
                 # Also of a run that blew up: what the rest would have cost at this rate.
                 share = row["steps"] / max(cost.done, 1)
-                row["runs"] = number + 1
+                row["runs"] += 1
                 row["seconds"] = min(row["seconds"] or np.inf, cost.seconds * share)
                 row["wall"] = min(row["wall"] or np.inf, cost.wall * share)
                 row["updates"] = round(self.comm.allreduce(int(run.updates)) * share)
-            if number == 0:
+            if row["runs"] == 1:
                 self._judge(row, state_of(run, self.problem)[0])
             run.close()
             spent += self.comm.bcast(cost.wall)
-            if spent > self.budget:
+            if spent > self.budget or self._enough(row["runs"], spent):
                 return
+
+    def _enough(self, runs: int, spent: float) -> bool:
+        """Whether to stop repeating: short runs go on, for a clock has its grain."""
+        return runs >= self.repeats and (
+            self.repeats == 1 or spent > SHORT or runs >= MORE * self.repeats
+        )
 
     def _warm(self, run: Run, row: dict[str, Any]) -> bool:
         """A run that is discarded; False if a whole one would take longer than the budget."""

@@ -4,6 +4,7 @@
 import csv
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from complexbody.errors import ChartError, CommandError
 from complexbody.norms import Norms, State
 from complexbody.problem import Problem
 from complexbody.references import Finer, Semidiscrete
+from complexbody.scenefile import SceneFile
 
 A, K, R = 1.0, 0.6, 0.3
 UNTIL = 0.7
@@ -322,6 +324,43 @@ def test_every_method_has_a_name_and_steps():
     assert len({c.name for c in known.values()}) == len(known)
     for c in known.values():
         assert np.diff(np.log(c.factors(3))) == pytest.approx(-math.log(c.ratio))
+
+
+SCENES = Path(__file__).parents[1] / "benchmarks" / "scenes"
+
+
+@pytest.mark.parametrize("name", ["bar", "phason"])
+def test_scenes_have_their_exact_solution(name, comm, shared_path, undrawn):
+    words = ["--methods", "synchronous", "--steps", "0.1", "--meshes", "cells=12,24", "--quiet"]
+    words += ["--until", "0.3", "--repeats", "1", "--out", str(shared_path)]
+    # The rate of an overdamped ν follows forces that are late by part of a step.
+    words += ["--set", "viscosity=2"] if name == "phason" else []
+    assert main(["chart", str(SCENES / f"{name}.py"), *words]) == 0
+    if comm.rank == 0:
+        rows = json.loads((shared_path / "chart.json").read_text())["rows"]
+        for norm in ("u", "nu", "u_dot", "nu_dot"):
+            coarse, fine = (row["total_error"][norm] for row in rows)
+            assert math.log2(coarse / fine) == pytest.approx(2, abs=0.2)
+
+
+@pytest.mark.parametrize(("name", "least"), [("notch", 64), ("plate", 32)])
+def test_scenes_are_graded(name, least, comm):
+    file = SceneFile(SCENES / f"{name}.py")
+    made = file.scene(comm, file.complete({}))
+    sizes = meshes.altitudes(made.mesh)
+    low, high = -comm.allreduce(-sizes.min(initial=np.inf), MPI.MAX), comm.allreduce(
+        sizes.max(initial=0.0), MPI.MAX
+    )  # fmt: skip
+    assert high / low > least
+    found = cb.chart(made, 0.02, ["local-leapfrog"], 1, repeats=1, comm=comm)
+    assert [row["status"] for row in found.rows] == ["done"]
+
+
+def test_every_scene_is_charted():
+    text = (SCENES.parents[1] / "Makefile").read_text()
+    names = {path.stem for path in SCENES.glob("*.py")}
+    assert names == {"bar", "notch", "phason", "plate"}
+    assert all(f"$(call CHART,{name})" in text for name in names)
 
 
 SCENE = """
