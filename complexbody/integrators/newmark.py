@@ -62,7 +62,7 @@ class NewmarkRun(PeerRun):
             self.ksp.setInitialGuessNonzero(True)
             with options(PREFIX, KRYLOV | {"ksp_rtol": str(method.tolerance)}, given):
                 self.ksp.setFromOptions()
-            self.ksp.setUp()
+                self.ksp.setUp()
         else:
             self.snes = PETSc.SNES().create(problem.comm)
             self.snes.setOptionsPrefix(PREFIX)

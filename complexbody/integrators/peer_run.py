@@ -13,11 +13,13 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from petsc4py import PETSc
 
 from complexbody import native
 from complexbody.errors import SolverError
 from complexbody.integrators.entries import Entries, energies
 from complexbody.integrators.semidiscrete import Blocks, SemiDiscrete
+from complexbody.integrators.solvers import last_line
 from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
@@ -91,7 +93,10 @@ class PeerRun:
         booked = system.loaded or self.damping is not None
         for _ in range(steps):
             x, v = system.x.copy(), self.v.copy()
-            why = self._step()
+            try:
+                why = self._step()
+            except PETSc.Error as error:
+                why = f"PETSc: {last_line(error)}"
             if why:
                 system.x[:], self.v[:] = x, v
                 system.q.x.scatter_forward()

@@ -11,107 +11,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-import scipy.linalg
-from mpi4py import MPI
 
-from complexbody.errors import IntegratorError, StepError
+from complexbody.errors import IntegratorError
 from complexbody.integrators.assembled import AssembledRun
 from complexbody.integrators.newmark import NewmarkRun
+from complexbody.integrators.peer_checks import (
+    explicit_step,
+    given_step,
+    limit_rk4,
+    one_of,
+    positive,
+    require,
+    require_momenta,
+)
 from complexbody.integrators.petsc_ts import FORMS, PetscRun
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
-from complexbody.stiffness import require_explicit_self_action
-from complexbody.timesets import critical_step, require_constant_inertia
-
-
-def _require(method: Any, problem: Problem) -> str:
-    """Refuse what no peer takes; the peer's name.
-
-    Raises:
-        IntegratorError: for general χ, and self-action that is not integrated in full.
-    """
-    name = type(method).__name__
-    require_constant_inertia(problem, name)
-    require_explicit_self_action(problem.scene, name)
-    if problem.scene.lumped:
-        raise IntegratorError(
-            f"{name} assembles energies in full, but the scene has self_action='lumped'. Use "
-            "Synchronous(), AVI() or LocalLeapfrog(), or self_action='consistent' in the scene."
-        )
-    return name
-
-
-def _require_momenta(method: Any, problem: Problem) -> None:
-    """Refuse what no peer but the leapfrog takes: missing inertia, moving supports; collective.
-
-    Raises:
-        IntegratorError: naming integrators that take it.
-    """
-    name = _require(method, problem)
-    for body in problem.inertias:
-        if np.linalg.eigvalsh(body.inertia_matrix)[0] <= 0:
-            raise IntegratorError(
-                f"{name} needs accelerations, which the descriptor of {body.name} has not: it has "
-                "no inertia. Use Synchronous(), AVI() or AssembledLeapfrog()."
-            )
-    if problem.comm.allreduce(bool(problem.supports.moving.any()), op=MPI.LOR):
-        raise IntegratorError(
-            f"{name} does not move supports, and one of this scene has a history. Use "
-            "Synchronous(), AVI() or AssembledLeapfrog()."
-        )
-
-
-def _given_step(method: Any, until: float) -> float:
-    """The step of an implicit peer, whose stability asks for none.
-
-    Raises:
-        StepError: if there is none.
-    """
-    if method.step is None:
-        raise StepError(
-            f"{type(method).__name__}: stability limits no step here, so there is no default. Give "
-            "step= in seconds."
-        )
-    return _divided(method.step, until)
-
-
-def _positive(method: Any, *names: str) -> None:
-    for name in names:
-        value = getattr(method, name)
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise StepError(f"{type(method).__name__}: {name} is {value}. Give a positive number.")
-
-
-def _one_of(method: Any, name: str, allowed: tuple[str, ...]) -> None:
-    value = getattr(method, name)
-    if value not in allowed:
-        raise IntegratorError(
-            f"{type(method).__name__}: {name}={value!r} is not known. Give one of "
-            f"{', '.join(allowed)}."
-        )
-
-
-def _divided(step: float, until: float) -> float:
-    """The step, shortened so that the end of the run falls on one."""
-    return float(until / np.ceil(until / min(step, until) * (1 - 1e-12)))
-
-
-def _explicit_step(method: Any, critical: float, until: float) -> float:
-    """The step of an explicit integrator.
-
-    Raises:
-        StepError: if it is above the critical one and ``unstable_ok`` is False.
-    """
-    step = _divided(method.safety * critical if method.step is None else method.step, until)
-    if step > critical * (1 + 1e-9) and not method.unstable_ok:
-        raise StepError(
-            f"The step {step:.6g} s is larger than the critical step {critical:.6g} s, so the "
-            "run would be unstable. Give a smaller step, or unstable_ok=True to see it happen."
-        )
-    return step
+from complexbody.timesets import critical_step
 
 
 @dataclass(frozen=True)
@@ -145,9 +64,9 @@ class AssembledLeapfrog:
     inertia: ClassVar[str] = "number or k×k matrix; 0 where viscosity is positive"
 
     def __post_init__(self) -> None:
-        _one_of(self, "force", ("assembly", "matrix"))
-        _one_of(self, "dissipation", SCHEMES)
-        _positive(self, "step", "safety")
+        one_of(self, "force", ("assembly", "matrix"))
+        one_of(self, "dissipation", SCHEMES)
+        positive(self, "step", "safety")
 
     @property
     def order(self) -> int:
@@ -161,14 +80,14 @@ class AssembledLeapfrog:
             StepError: if the step is above the critical one and ``unstable_ok`` is False.
             IntegratorError: for a scene this integrator cannot take.
         """
-        _require(self, problem)
+        require(self, problem)
         if self.force == "matrix" and not problem.kernels.densities.linear:
             raise IntegratorError(
                 "AssembledLeapfrog: force='matrix' needs energies with a constant Hessian, and one "
                 "of these is not. Use force='assembly'."
             )
         critical = critical_step(problem, self.dissipation)
-        step = _explicit_step(self, critical, until)
+        step = explicit_step(self, critical, until)
         return AssembledRun(problem, self, step, critical)
 
 
@@ -204,7 +123,7 @@ class Newmark:
     inertia: ClassVar[str] = "number or k×k matrix, positive definite"
 
     def __post_init__(self) -> None:
-        _positive(self, "step", "tolerance")
+        positive(self, "step", "tolerance")
         if not (self.gamma >= 0.5 and 2 * self.beta >= self.gamma and np.isfinite(self.beta)):
             raise IntegratorError(
                 f"Newmark: beta={self.beta}, gamma={self.gamma} is not stable for all steps. Give "
@@ -228,8 +147,8 @@ class Newmark:
             StepError: if there is no step.
             IntegratorError: for a scene this integrator cannot take.
         """
-        _require_momenta(self, problem)
-        return NewmarkRun(problem, self, _given_step(self, until), float("inf"))
+        require_momenta(self, problem)
+        return NewmarkRun(problem, self, given_step(self, until), float("inf"))
 
 
 @dataclass(frozen=True)
@@ -270,8 +189,8 @@ class PetscTS:
     inertia: ClassVar[str] = "number or k×k matrix, positive definite"
 
     def __post_init__(self) -> None:
-        _one_of(self, "kind", tuple(FORMS))
-        _positive(self, "step", "safety", "tolerance")
+        one_of(self, "kind", tuple(FORMS))
+        positive(self, "step", "safety", "tolerance")
         if not 0 <= self.radius <= 1:
             raise IntegratorError(f"PetscTS: radius is {self.radius}. Give a number from 0 to 1.")
 
@@ -300,25 +219,8 @@ class PetscTS:
                 ``unstable_ok`` is False.
             IntegratorError: for a scene this integrator cannot take.
         """
-        _require_momenta(self, problem)
+        require_momenta(self, problem)
         if not self.explicit:
-            return PetscRun(problem, self, _given_step(self, until), float("inf"))
-        critical = _limit_rk4(problem)
-        return PetscRun(problem, self, _explicit_step(self, critical, until), critical)
-
-
-def _limit_rk4(problem: Problem) -> float:
-    """Critical step of the classical Runge–Kutta method [s], from that of the leapfrog.
-
-    Its region of stability holds the left half of the disc of radius 2.615 and the real axis down
-    to −2.785. Eigenvalues are in that disc (underdamped, |λ| ≤ ω ≤ 2/critical) or real and not
-    below −max η/ρ̄ (overdamped).
-    """
-    critical = critical_step(problem, "symmetric")
-    rates = [
-        scipy.linalg.eigvalsh(body.viscosity_matrix, body.inertia_matrix)[-1]
-        for body in problem.inertias
-    ]
-    largest = float(max(rates))
-    limit = 2.615 / 2 * critical
-    return min(limit, 2.785 / largest) if largest > 0 else limit
+            return PetscRun(problem, self, given_step(self, until), float("inf"))
+        critical = limit_rk4(problem)
+        return PetscRun(problem, self, explicit_step(self, critical, until), critical)

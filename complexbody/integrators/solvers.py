@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from petsc4py import PETSc
+
+from complexbody.errors import IntegratorError
 
 if TYPE_CHECKING:
     from complexbody.integrators.peer_run import PeerRun
@@ -19,9 +21,18 @@ KRYLOV = {
 }  # fmt: skip
 
 
+def last_line(error: Any) -> str:
+    """What PETSc says of an error, without where it happened."""
+    return str(error).strip().splitlines()[-1].split("] ")[-1].rstrip(".")
+
+
 @contextmanager
 def options(prefix: str, defaults: Mapping[str, str], given: Mapping[str, str]) -> Iterator[None]:
-    """PETSc options for a ``setFromOptions`` inside: what is given, else PETSc's, else defaults."""
+    """PETSc options for a ``setFromOptions`` inside: what is given, else PETSc's, else defaults.
+
+    Raises:
+        IntegratorError: for options that PETSc does not take.
+    """
     database = PETSc.Options(prefix)
     mine = {name: value for name, value in defaults.items() if not database.hasName(name)}
     mine |= dict(given)
@@ -29,6 +40,11 @@ def options(prefix: str, defaults: Mapping[str, str], given: Mapping[str, str]) 
         database.setValue(name, value)
     try:
         yield
+    except PETSc.Error as error:
+        raise IntegratorError(
+            f"PETSc does not take its options: {last_line(error)}. Change options={dict(given)} or "
+            f"those on its command line that begin with {prefix}."
+        ) from error
     finally:
         for name in mine:
             database.delValue(name)
