@@ -9,6 +9,7 @@ nothing.
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,7 @@ def draw(chart: Chart, path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    rows, names = chart.rows, list(fronts.by_method(chart.rows))
+    rows = chart.rows
     styles = {c.name: c for c in contenders().values()}
     kinds = [k for k in fronts.ERRORS if chart.knows(k)]
     with plt.rc_context({
@@ -56,8 +57,10 @@ def draw(chart: Chart, path: Path) -> None:
                     axes[row, column].set_title(_title(chart, kind))
         for ax in axes.flat if not kinds else ():
             ax.text(0.5, 0.5, "no method ran to the end", ha="center", transform=ax.transAxes)
+        names = [n for n, own in fronts.by_method(rows).items() if any(map(_shown, own))]
         handles = [_handle(styles.get(name), name) for name in names]
-        note, ncols = _footnote(chart, rows), 4 if columns > 1 else 2
+        width, ncols = (190, 4) if columns > 1 else (105, 2)
+        note = _footnote(chart, rows, width)
         below = 0.012 + 0.0135 * (note.count("\n") + 1)
         above = below + 0.02 + 0.021 * -(-len(names) // ncols)
         figure.legend(
@@ -232,7 +235,11 @@ def _heading(chart: Chart) -> str:
     return chart.head.get("title", "") + (f", t = {until:g}" if until is not None else "")
 
 
-def _footnote(chart: Chart, rows: Sequence[Mapping[str, Any]]) -> str:
+def _shown(row: Mapping[str, Any]) -> bool:
+    return row["status"] in ("done", "unstable")
+
+
+def _footnote(chart: Chart, rows: Sequence[Mapping[str, Any]], width: int) -> str:
     """Who is missing and why; where and by what this was measured."""
     lines = []
     for status, what in (
@@ -263,4 +270,4 @@ def _footnote(chart: Chart, rows: Sequence[Mapping[str, Any]]) -> str:
         f"runs, {ranks} rank{'s' if ranks > 1 else ''} on {cpu}; complexbody {commit}. "
         "Solid: ours; dashed: peers."
     )
-    return "\n".join(lines)
+    return "\n".join(textwrap.fill(line, width) for line in lines)

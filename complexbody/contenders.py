@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import complexbody
 from complexbody.errors import CommandError
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
+from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
 
 #: A method from the factor and the step [s], which divides the run.
@@ -54,16 +54,6 @@ class Contender:
         return [self.limit / self.ratio**i for i in range(count)]
 
 
-def _peer(kind: str, *arguments: Any, own: bool = False, **options: Any) -> Make:
-    """A peer by the name of its class; ``own``: its steps are factors of a limit of its own."""
-
-    def make(factor: float, step: float) -> Any:
-        steps = {"safety": factor} if own else {"step": step}
-        return getattr(complexbody, kind)(*arguments, **steps, **options)
-
-    return make
-
-
 _OURS = (
     Contender(
         "synchronous", "Synchronous", lambda factor, step: Synchronous(step),
@@ -99,39 +89,38 @@ _OURS = (
 _FAR, _RATIO = 64.0, 4.0
 _PEERS = (
     Contender(
-        "assembly", "leapfrog, dolfinx assembly", _peer("AssembledLeapfrog", force="assembly"),
+        "assembly", "leapfrog, dolfinx assembly",
+        lambda factor, step: AssembledLeapfrog("assembly", step),
         peer=True, colour="#666666", line="--", marker="o",
     ),
     Contender(
-        "matrix", "leapfrog, PETSc matrix", _peer("AssembledLeapfrog", force="matrix"),
+        "matrix", "leapfrog, PETSc matrix", lambda factor, step: AssembledLeapfrog("matrix", step),
         peer=True, colour="#009E73", line="--", marker="s",
     ),
     Contender(
-        "petsc-rk4", "PETSc TS, Runge–Kutta 4", _peer("PetscTS", "rk4", own=True),
+        "petsc-rk4", "PETSc TS, Runge–Kutta 4", lambda factor, step: PetscTS("rk4", safety=factor),
         peer=True, colour="#332288", line="--", marker="D",
     ),
     Contender(
-        "petsc-alpha2", "PETSc TS, generalised α", _peer("PetscTS", "alpha2"), _FAR, _RATIO,
+        "petsc-alpha2", "PETSc TS, generalised α",
+        lambda factor, step: PetscTS("alpha2", step), _FAR, _RATIO,
         peer=True, colour="#AA4499", line="--", marker="^",
     ),
     Contender(
-        "petsc-cn", "PETSc TS, Crank–Nicolson", _peer("PetscTS", "cn"), _FAR, _RATIO,
+        "petsc-cn", "PETSc TS, Crank–Nicolson",
+        lambda factor, step: PetscTS("cn", step), _FAR, _RATIO,
         peer=True, colour="#999933", line="--", marker="v",
     ),
     Contender(
-        "newmark", "Newmark", _peer("Newmark"), _FAR, _RATIO,
+        "newmark", "Newmark", lambda factor, step: Newmark(step), _FAR, _RATIO,
         peer=True, colour="#44AA99", line="--", marker="P",
     ),
 )  # fmt: skip
-_NEEDS = {"assembly": "AssembledLeapfrog", "matrix": "AssembledLeapfrog", "newmark": "Newmark"}
 
 
 def contenders() -> dict[str, Contender]:
     """All methods by key: ours first, then the peers."""
-    there = [
-        p for p in _PEERS if hasattr(complexbody, _NEEDS.get(p.key, "PetscTS"))
-    ]  # fmt: skip
-    return {c.key: c for c in (*_OURS, *there)}
+    return {c.key: c for c in (*_OURS, *_PEERS)}
 
 
 def chosen(methods: Sequence[str | Contender] | None, general: bool) -> list[Contender]:

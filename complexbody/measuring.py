@@ -191,7 +191,7 @@ def told(row: dict[str, Any]) -> str:
     place = ", ".join(f"{k}={v}" for k, v in row["mesh"].items())
     head = f"{place:12s} {row['method']:26s} ×{row['factor']:<8.4g}"
     if row["status"] != "done":
-        return f"{head} {row['status']}: {row['message']}"
+        return f"{head} {row['status']}: {row['message'].split('. ')[0]}"
     parts = [f"{row['seconds']:9.3g} s {row['updates']:10.3g} updates"]
     for kind in ("total", "time"):
         error = (row[f"{kind}_error"] or {}).get("fields")
