@@ -251,7 +251,7 @@ def _footnote(chart: Chart, rows: Sequence[Mapping[str, Any]], width: int) -> st
             if row["status"] == status:
                 found[row["method"]] = found.get(row["method"], 0) + 1
         if found:
-            told = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in found.items())
+            told = "; ".join(f"{name} ({n})" if n > 1 else name for name, n in found.items())
             lines.append(f"{what}: {told}.")
     if "total" not in chart.references:
         lines.append("No total error: one mesh, and no exact solution.")
