@@ -71,12 +71,12 @@ class ChartFile:
         if data is None:
             return
         known = isinstance(data, dict) and data.get("schema") == SCHEMA
-        if not known or data.get("identity") != self.identity:
-            differ = [k for k, v in self.identity.items() if data["identity"].get(k) != v] if (
-                known
-            ) else ["its schema"]  # fmt: skip
+        differ = ["schema"]
+        if known:
+            differ = [k for k, v in self.identity.items() if data["identity"].get(k) != v]
+        if differ:
             raise ChartError(
-                f"{path} is of another chart: {', '.join(differ)} differ. Give another folder, or "
+                f"{path} is of another chart (its {', '.join(differ)}). Give another folder, or "
                 "--fresh to begin anew."
             )
         self.rows = {row["key"]: row for row in data["rows"]}

@@ -15,7 +15,7 @@ import linecache
 import sys
 import traceback
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -184,17 +184,14 @@ class SceneFile:
         """The file's content."""
         return self._source
 
-    def exact(self, t: float, parameters: Mapping[str, Any]) -> Any:
+    def exact(self, t: float, **parameters: Any) -> Any:
         """What the file's ``exact(t, …)`` says, given those of the parameters that it takes.
 
         Raises:
             CommandError: naming file, line and exception.
         """
-        known = inspect.signature(self.module.exact).parameters
-        anything = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values())
-        taken = {n: v for n, v in parameters.items() if anything or n in known}
         with self._blamed("exact()"):
-            return self.module.exact(t, **taken)
+            return self.module.exact(t, **accepted(self.module.exact, parameters))
 
     def has(self, name: str) -> bool:
         """Whether the file has a function ``name``."""
@@ -256,6 +253,14 @@ class SceneFile:
 
 def _a(thing: Any) -> str:
     return "None" if thing is None else f"a {type(thing).__name__}"
+
+
+def accepted(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the values that a function has parameters for, by name."""
+    known = inspect.signature(function).parameters
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values()):
+        return dict(values)
+    return {name: value for name, value in values.items() if name in known}
 
 
 def assignments(texts: Sequence[str]) -> dict[str, Any]:

@@ -34,6 +34,7 @@ from complexbody.files import on_first_rank
 from complexbody.measuring import Point, told
 from complexbody.references import Exact, Finer, Reference, Semidiscrete
 from complexbody.scene import Scene
+from complexbody.scenefile import accepted
 
 Factory = Callable[..., Scene]
 
@@ -121,9 +122,10 @@ def chart(
         steps: How many steps each method makes, from its stable limit down (4), or the factors of
             the critical step themselves, for all methods.
         meshes: One parameter of the function and its values, from coarse to fine.
-        exact: ``exact(t, parameters)`` gives the exact solution: see :class:`Exact`. Without it
-            total errors are against the finest of several meshes made twice as fine (one process
-            only), and unknown for a single mesh.
+        exact: ``exact(t, **parameters)`` gives the exact solution: see
+            :class:`complexbody.references.Exact`; it gets those of the parameters that it takes.
+            Without it total errors are against the finest of several meshes made twice as fine (one
+            process only), and unknown for a single mesh.
         out: Folder of chart.json, .csv and .png. Points that are there already are not run again.
         repeats: Runs of each point, the fastest of which counts.
         budget: Seconds after which a point is not repeated; one that would take longer is left out
@@ -226,8 +228,8 @@ class _Plan:
     def total(self, scene: Scene, level: int) -> Reference | None:
         """What total errors are measured against, if anything."""
         if self.exact is not None:
-            given = {**self.parameters, **self.each()[0]}
-            return Exact(lambda t: self.exact(t, given), self.until, scene)
+            given = accepted(self.exact, {**self.parameters, **self.each()[0]})
+            return Exact(lambda t: self.exact(t, **given), self.until, scene)
         if not self.meshes:
             return None
         (name, values), *_ = self.meshes.items()

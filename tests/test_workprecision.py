@@ -46,7 +46,7 @@ def pair(comm, cells=16, dim=1):
     )  # fmt: skip
 
 
-def exact(t, parameters):
+def exact(t):
     """The pair's motion in one dimension."""
     squares, waves = np.linalg.eigh(np.pi**2 * np.array([[A, R], [R, K]]))
     part = waves.T @ [1.0, 0.5]
