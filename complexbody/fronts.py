@@ -110,7 +110,9 @@ def winners(
     out = []
     for level in decades(rows, cost, error, norm):
         costs = {name: cost_at(f, level) for name, f in fronts.items()}
-        ranked = sorted((c, name) for name, c in costs.items() if math.isfinite(c))
+        # Equal costs (of updates, often) are told apart by nothing but round-off: rows decide.
+        known = [(c, name) for name, c in costs.items() if math.isfinite(c)]
+        ranked = sorted(known, key=lambda pair: float(f"{pair[0]:.6g}"))
         if not ranked:
             continue
         least, winner = ranked[0]

@@ -200,6 +200,13 @@ def test_winner_of_each_decade():
     assert not any(w["short"] for w in (two, three, four))
 
 
+def test_a_tie_goes_to_the_first():
+    points = [(2.0, 1e-1), (20.0, 1e-3)]
+    rows = [*rows_of("zeta", points), *rows_of("alpha", points, peer=True)]
+    for won in fronts.winners(rows):
+        assert (won["winner"], won["margin"], won["over_peer"]) == ("zeta", 1.0, 1.0)
+
+
 def test_winner_may_be_a_peer_and_may_be_uncertain():
     rows = [
         *rows_of("ours", [(6.0, 1e-2), (60.0, 1e-4)]),
