@@ -103,7 +103,10 @@ def _scene(to: argparse.ArgumentParser) -> None:
 def _integrator(to: argparse.ArgumentParser) -> None:
     group = to.add_argument_group("integrator")
     names = tuple(commands.INTEGRATORS)
-    group.add_argument("--integrator", choices=names, help=f"default {names[0]}")
+    group.add_argument(
+        "--integrator", metavar="NAME", choices=names,
+        help=f"{', '.join(names[:-1])} or {names[-1]}; default {names[0]}",
+    )  # fmt: skip
     group.add_argument(
         "--step", metavar="H", type=float,
         help="step [s], of local-leapfrog the coarse one; default: safety times the critical step",

@@ -63,7 +63,7 @@ def scene(comm):
 """
 _BOTH = (
     "--set --until --integrator --step --safety --dissipation --start --critical --unstable-ok "
-    "--balanced --stabilisation --levels --debug"
+    "--balanced --stabilisation --levels --force --kind --debug"
 )
 OPTIONS = {
     "run": f"{_BOTH} --out --every --fields --probe --probe-steps --ledger-steps --no-picture "
@@ -227,6 +227,8 @@ def test_quiet_prints_nothing(bar, call, shared_path):
             ("--integrator", "local-leapfrog", "--stabilisation", "0.1", "--levels", "2"),
             {"integrator": "local-leapfrog", "stabilisation": 0.1, "levels": 2},
         ),
+        (("--integrator", "assembled-leapfrog", "--force", "matrix"), {"force": "matrix"}),
+        (("--integrator", "petsc-ts", "--kind", "cn", "--step", "0.1"), {"kind": "cn"}),
     ],
 )
 def test_options_go_before_defaults(bar, words, settings):
@@ -234,6 +236,20 @@ def test_options_go_before_defaults(bar, words, settings):
     found = commands._settings(parser().parse_args(["run", "bar.py", *words]), file)
     assert {name: found[name] for name in settings} == settings
     assert file.defaults["probes"] == {"mid": (0.5,)}
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("assembled-leapfrog", "--force", "matrix"), "discrete energy identity"),
+        (("newmark", "--step", "0.05"), "linear iterations per step"),
+        (("petsc-ts", "--kind", "theta", "--step", "0.05", "--petsc", "pc_type=sor"), "not limit"),
+    ],
+)
+def test_peers(bar, call, shared_path, words, told):
+    words = ("--integrator", *words, "--no-picture", "--out", shared_path / "out")
+    code, text, err = call("run", bar(), *words)
+    assert (code, err) == (0, "") and told in text, text
 
 
 def test_every_goes_before_times(bar):

@@ -100,7 +100,8 @@ class Implicit:
             same = Synchronous(self.step, self.safety, scheme, start, unstable_ok=self.unstable_ok)
             return same.prepare(problem, until)
         require_explicit_self_action(problem.scene, "solving for momenta")
-        if np.any(np.linalg.eigvalsh(problem.masses.inertia) <= 0):
+        # By body: masses are those of this rank's nodes, and all ranks must say the same.
+        if any(np.linalg.eigvalsh(b.inertia_matrix)[0] <= 0 for b in problem.scene.bodies):
             raise IntegratorError(
                 "Implicit solves for momenta, which a descriptor without inertia does not have. "
                 "Use Synchronous() or AVI() with dissipation='exact'."

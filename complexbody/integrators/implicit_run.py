@@ -71,6 +71,7 @@ class ImplicitRun(ForceRun):
         disc, kernels = problem.disc, problem.kernels
         k = problem.scene.descriptor
         kernels.select(problem.masses.diagonal, damped=False)
+        kernels.state.klass = problem.masses.classes.ctypes.data  # read by the books
         self.previous, self.next, self._rates = (
             native.aligned(kernels.x.shape) for _ in range(3)
         )  # fmt: skip

@@ -9,6 +9,7 @@ import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import ufl
+from dense import halves
 from harness import largest, refused
 from mpi4py import MPI
 from verification.bubbles import Bubble, collapse_time
@@ -151,6 +152,20 @@ def test_books_balance_to_second_order(comm):
         )
         balance.append(np.abs(result.ledger["balance"]).max())
     assert 1.8 < np.log2(balance[0] / balance[1]) < 2.2, balance
+
+
+@pytest.mark.parametrize("quadrature", QUADRATURES)
+def test_books_know_regions(comm, quadrature):
+    """Kinetic energies of two regions that differ in density and inertia."""
+    mesh = line(comm, 10)
+    bodies = [cb.Body(1, stretching, rho, omega, displacement=1)
+              for rho, omega in ((1.0, 2.0), (5.0, 7.0))]  # fmt: skip
+    scene = cb.Scene(mesh, dict(enumerate(bodies, 1)), cell_tags=halves(mesh),
+                     initial=cb.Initial(u_dot=1.0, nu_dot=2.0))  # fmt: skip
+    method = cb.Implicit(1e-3, quadrature=quadrature, solve="always")
+    ledger = cb.simulate(scene, method, until=1e-2, ledger_steps=1).ledger
+    for name, energy in (("kinetic_u", 1.5), ("kinetic_nu", 9.0)):
+        assert np.abs(ledger[name] - energy).max() < 1e-11, name
 
 
 @pytest.mark.serial
