@@ -129,7 +129,7 @@ def chart(
         out: Folder of chart.json, .csv and .png. Points that are there already are not run again.
         repeats: Runs of each point, the fastest of which counts.
         budget: Seconds after which a point is not repeated; one that would take longer is left out
-            and says so.
+            and says so, until a chart with a larger budget.
         parameters: More parameters of the function.
         comm: Ranks.
         norm: The error that is judged and drawn, one of :data:`complexbody.fronts.NORMS`.
@@ -270,13 +270,18 @@ class _Runner:
                 for factor in self._factors(contender):
                     key = json.dumps([contender.key, float(factor), mesh], default=repr)
                     keys.append(key)
-                    if key not in self.file.rows:
+                    if self._missing(key):
                         todo.append((key, contender, float(factor)))
             if todo:
                 self._mesh(mesh, scene, todo)
         if self.total is not None:
             self.total.close()
         return keys
+
+    def _missing(self, key: str) -> bool:
+        """Whether a point is to be run: also one that was too long for a smaller budget."""
+        row = self.file.rows.get(key)
+        return row is None or (row["status"] == "too long" and row["budget"] < self.budget)
 
     def _factors(self, contender: Contender) -> Sequence[float]:
         steps = 4 if self.plan.steps is None else self.plan.steps
@@ -296,6 +301,7 @@ class _Runner:
             row = {
                 "key": key, "method": contender.name, "peer": contender.peer, "mesh": dict(mesh),
                 "factor": factor, "ranks": self.comm.size, "commit": self.commit,
+                "budget": self.budget,
                 **found.measure(),
             }  # fmt: skip
             self.file.references[name] = reference.about()
