@@ -22,6 +22,7 @@ from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
 from complexbody.simulate import simulate
 from complexbody.stability import stability
+from complexbody.workprecision import Chart, chart
 
 __version__ = "0.1.0"
 
@@ -30,6 +31,7 @@ __all__ = [
     "AssembledLeapfrog",
     "Body",
     "BodyForce",
+    "Chart",
     "ComplexBodyError",
     "Fix",
     "Implicit",
@@ -44,6 +46,7 @@ __all__ = [
     "Scene",
     "Synchronous",
     "Traction",
+    "chart",
     "constant",
     "plan",
     "ramp",

@@ -19,7 +19,8 @@ from typing import Any, NoReturn
 
 from mpi4py import MPI
 
-from complexbody import __version__, cli_plan, cli_stability, commands
+from complexbody import __version__, cli_chart, cli_plan, cli_stability, commands
+from complexbody.cli_texts import EPILOG, RUN_EPILOG
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
 from complexbody.integrators.petsc_ts import FORMS
@@ -36,43 +37,6 @@ from complexbody.together import (
     signals,
     together,
 )
-
-_EPILOG = """\
-examples:
-  complexbody check demos/impact.py               what would it do, and how long would it take?
-  complexbody plan demos/impact.py                what does it need, and what not?
-  complexbody run demos/impact.py                 as the file says
-  complexbody run demos/impact.py --set cells=80 --until 2e-5 --out results/fine
-  mpirun -n 4 complexbody run demos/impact.py     the same on four processes
-  complexbody info                                versions, compiler, what is missing
-
-a scene file is a Python file with
-  import complexbody as cb
-  def scene(comm, cells=40):                      parameters are set by --set cells=80
-      return cb.Scene(mesh, body, supports=…, loads=…, initial=…)
-and, if it likes,
-  DEFAULTS = dict(until=1e-5, every=1e-7)         what the options of run override
-  def check(result): ...                          raises AssertionError if the physics is wrong
-  def picture(result, path): ...                  draws into the file path
-
-exit codes:
-  0  done                          4    the run diverged
-  1  a bug of complexbody          5    the scene file's check failed
-  2  wrong input: what and where   130  stopped by Ctrl-C
-  3  something is not installed    143  stopped by SIGTERM
-"""
-_RUN_EPILOG = """\
-Options that are not given are taken from DEFAULTS of the scene file, then as shown here. Results go
-to DIR: run.json (what was run, and how it ended), ledger.csv, FIELD.xdmf with FIELD.h5 (open the
-.xdmf in ParaView), probe-NAME.csv and picture.png.
-
-examples:
-  complexbody run demos/impact.py --set refine=1.5 --every 1e-7 --out results/fine
-  complexbody run demos/impact.py --dissipation forward --start one-sided
-  complexbody run demos/impact.py --integrator local-leapfrog --levels 3
-  complexbody run demos/impact.py --fields u,stress --probe tip=1,0.5,0 --no-picture
-  mpirun -n 4 complexbody run demos/impact.py
-"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -94,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     main = _Parser(
         prog="complexbody",
         description="Dynamics of complex bodies by variational integrators, on FEniCSx.",
-        epilog=_EPILOG,
+        epilog=EPILOG,
         formatter_class=_wide,
         allow_abbrev=False,
     )
@@ -110,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
         made.add_argument("--debug", action="store_true", help="show tracebacks of errors")
         return made
 
-    run = command("run", commands.run, "run a scene file", _RUN_EPILOG)
+    run = command("run", commands.run, "run a scene file", RUN_EPILOG)
     _scene(run)
     _integrator(run)
     _output(run)
@@ -125,6 +89,7 @@ def parser() -> argparse.ArgumentParser:
     _scene(planned)
     _integrator(planned)
     cli_stability.declare(command)
+    cli_chart.add(command, _scene)
     command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
     return main
 
