@@ -44,6 +44,7 @@ class Problem:
             the lower bound γI in its place.
         convexity, kinetic_range: Of general χ: how γ, Ξ and T₀ are measured (None if there is no
             such χ), and what they are at the initial state.
+        quiet: Whether runs may skip cells at rest, which changes no bit.
         warnings: What A1 leaves to the boundary data, in words.
 
     Raises:
@@ -63,6 +64,7 @@ class Problem:
         self._start = boundary.initial(scene, self.action)
         self._read_inertia()
         self.node_step: float | Array = 0.0
+        self.quiet = True
         self.arrange()
         self.warnings = self._check_energy()
 

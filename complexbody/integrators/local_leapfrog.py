@@ -226,6 +226,11 @@ class LocalLeapfrogRun(SynchronousRun):
         if problem.comm.size > 1:
             self._messages = [octaves.Message(problem, table.touched[:, i]) for i in range(L + 1)]
 
+    def _watch(self) -> None:
+        """Octaves act on all their cells: only a run without any skips quiet ones."""
+        if not self.levels:
+            super()._watch()
+
     def _softness(self) -> Array:
         """(Δt²/2) M̂⁻¹ on free components per class: how far a unit force moves in a step."""
         masses, mean = self.problem.masses, self.recursion.mean

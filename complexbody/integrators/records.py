@@ -61,7 +61,7 @@ class RecordRun:
     Attributes:
         time: t at the last beat's end [s]; steps: beats done; step: their length [s].
         critical: Critical step of the smallest cell [s], that of a synchronous run.
-        updates: Cell updates (forces) done by this rank.
+        updates, skipped: Cell updates (forces) done by this rank, and of quiet cells, not needed.
         record: Node records (nodes + 1, doubles per node); the last one is padding.
         time_sets: Who acts when: what the paper calls Θ, with speed-ups.
     """
@@ -81,7 +81,7 @@ class RecordRun:
         self.problem, self.method, self.step = problem, method, step
         smallest = float(np.min(critical, initial=np.inf))
         self.critical = float(problem.comm.allreduce(smallest, op=MPI.MIN))
-        self.steps, self.updates = 0, 0
+        self.steps, self.updates, self.skipped = 0, 0, 0
         disc, kernels, masses = problem.disc, problem.kernels, problem.masses
         # Components that differ in their rate are drifted one by one, like those without inertia.
         slow = not masses.diagonal or (masses.damped and not masses.one_rate)

@@ -16,9 +16,11 @@ from mpi4py import MPI
 
 from complexbody import native
 from complexbody.errors import IntegratorError
+from complexbody.integrators.activity import ENOUGH, Activity, active
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.synchronous_books import entries
+from complexbody.kernels.library import State
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -32,7 +34,10 @@ class SynchronousRun(ForceRun):
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
-        updates: Cell updates done by this rank.
+        updates, skipped: Cell updates done by this rank, and of quiet cells, not needed.
+        activity: Which cells are quiet; None if that is not watched for.
+        watched: What the C functions read, with the activity in it; None if energies of quiet cells
+            are not zero.
         support_work: Work of this rank's moving supports in the half step before a sample [J].
     """
 
@@ -43,7 +48,9 @@ class SynchronousRun(ForceRun):
         if not masses.diagonal:  # the same on all ranks, unlike what moves there
             self._refuse_partial()
         kernels.select(masses.diagonal, masses.damped)
-        self.c, self.state = kernels.c, ctypes.byref(kernels.state)
+        self.c = kernels.c
+        self.activity: Activity | None = None
+        self.watched: State | None = None
         rec = masses.recursion(step, method.dissipation)
         if method.start == "one-sided":
             # Kicks sit at the left ends of intervals: momenta at t_n are those before the kick.
@@ -70,6 +77,33 @@ class SynchronousRun(ForceRun):
         kernels.x[:-1, : disc.n] = problem.initial_fields
         self.support_work = 0.0
         kernels.reset_forces()
+        # A copy, since whoever else asks the kernels asks for all cells.
+        self._own = State.from_buffer_copy(s)
+        self.state = ctypes.byref(self._own)
+
+    def _watch(self) -> None:
+        """From now on skip what is quiet, if enough is; f must be its constant part."""
+        problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
+        if not (problem.quiet and disc.blocks):
+            return
+        stirred = (kernels.x[:-1] != 0).any(axis=1) | (kernels.v[:-1] != 0).any(axis=1)
+        stirred |= (kernels.f[:-1] != 0).any(axis=1)
+        stirred[problem.load_position // disc.record] = True
+        if active(disc.cells, stirred) > ENOUGH:
+            return
+        awake, energetic = kernels.restless()
+        ends = np.append(disc.chunks[:, 3], disc.nodes)
+        late = np.array([len(disc.chunks)])
+        self.activity = Activity(
+            self.c, disc.chunks[:, 1], disc.cells, ends, stirred, awake, late
+        )
+        self._own.activity = ctypes.addressof(self.activity.state)
+        self.watched = None if energetic else self._own
+        self.c.cb_look(self.state)
+
+    def saved(self) -> int:
+        """Cell updates of quiet cells so far."""
+        return 0 if self.activity is None else self.activity.skipped
 
     def _refuse_partial(self) -> None:
         n_u, (rows, columns) = self.problem.scene.displacement, self.problem.moving
@@ -94,7 +128,6 @@ class SynchronousRun(ForceRun):
         if steps <= 0:
             return
         problem, disc = self.problem, self.problem.disc
-        self.updates += steps * disc.count
         alone = problem.comm.size == 1 and not len(problem.moving[0])
         if alone:
             times = (self.steps + np.arange(steps)) * self.step
@@ -106,9 +139,10 @@ class SynchronousRun(ForceRun):
                 ctypes.c_int64(amplitudes.shape[1]),
             )  # fmt: skip
             self.steps += steps
-            return
-        for _ in range(steps):
-            self._overlapped()
+        else:
+            for _ in range(steps):
+                self._overlapped()
+        self._count(steps * disc.count)
 
     def _overlapped(self) -> None:
         """One step with messages flying while interior cells are worked on."""
@@ -131,17 +165,17 @@ class SynchronousRun(ForceRun):
         problem, kernels = self.problem, self.problem.kernels
         amplitude = self.amplitude(self.time)
         kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
-        self.c.cb_update(self.state, ctypes.c_int64(0), ctypes.c_int64(problem.disc.late))
+        self.c.cb_update(self.state)
         self._late()
         kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
         self.steps += 1
         self.ready = False
 
     def _late(self) -> None:
-        disc = self.problem.disc
         if len(self.problem.moving[0]):
             self._move()
-        self.c.cb_update(self.state, ctypes.c_int64(disc.late), ctypes.c_int64(disc.nodes))
+        self.c.cb_update_late(self.state)
+        self.c.cb_look(self.state)
 
     def _move(self) -> None:
         rows, columns = self.problem.moving
@@ -189,6 +223,7 @@ class SynchronousRun(ForceRun):
         kernels.x[:-1, :n] += self.step * v1
         kernels.reset_forces()
         self.steps, self.ready = 1, False
+        self._watch()
 
     # --- what a user sees at t_n -------------------------------------------------------------
 
@@ -202,7 +237,7 @@ class SynchronousRun(ForceRun):
         else:
             self.c.cb_rates(
                 self.state, native.pointer(self._to_rate), native.pointer(self._force_to_rate),
-                ctypes.c_int64(0), ctypes.c_int64(disc.nodes), native.pointer(self.rates),
+                native.pointer(self.rates),
             )  # fmt: skip
             if len(self.problem.moving[0]):
                 self._sample_moving()

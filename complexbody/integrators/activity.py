@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""Which cells are quiet: all their nodes at zero, so that neither force nor rate can come of them.
+
+Forces and rates of nodes at (u, ν) = 0 are exactly zero where the density has no force there and no
+load or support acts. Skipping what is quiet therefore changes no bit of a trajectory. Cells are
+watched by chunks of blocks, and only the chunks next to what moves are looked at (quiet.h). Knows
+chunks and nodes, no integrator.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+#: Share of awake cells above which nothing is skipped: ENOUGH in quiet.h.
+ENOUGH = 0.9
+
+
+class State(ctypes.Structure):
+    """Mirror of ``activity`` in quiet.h."""
+
+    _fields_ = (
+        *((n, ctypes.c_int64) for n in ("on", "chunks", "cells", "awake_cells", "skipped")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("awake", "near", "stirred", "size", "node_from", "node", "range_from",
+                         "range", "chunk_from", "chunk")
+        ),
+    )  # fmt: skip
+
+
+class Activity:
+    """Chunks of cells and ranges of nodes, and what is awake of them.
+
+    Args:
+        c: A library with quiet.h in it.
+        blocks: Ends of the chunks' blocks (chunks,), the first starting at 0.
+        cells: Nodes of cells (blocks, d + 1, W); those at or above ``ranges[-1]`` are padding.
+        ranges: Ends of the ranges of nodes; the last is the number of nodes.
+        stirred: Nodes that are not at zero or that something acts on, shape (nodes,).
+        awake: Chunks that are never quiet (chunks,).
+        always: Ranges that are always looked after.
+
+    Attributes:
+        state: What the C functions read.
+        skipped: Cell updates skipped so far.
+    """
+
+    def __init__(
+        self, c: ctypes.CDLL, blocks: Ints, cells: npt.NDArray[np.int32], ranges: Ints,
+        stirred: Flags, awake: Flags, always: Ints,
+    ) -> None:  # fmt: skip
+        chunks, nodes = len(blocks), int(ranges[-1])
+        firsts = np.concatenate([[0], blocks[:-1]]).astype(np.int64)
+        of_block = np.repeat(np.arange(chunks), blocks - firsts)
+        real = cells[:, 0, :] < nodes
+        size = np.bincount(of_block, weights=real.sum(axis=1), minlength=chunks).astype(np.int64)
+        self.state = State(1, chunks, int(size.sum()))
+        pairs = of_block[:, None] * (nodes + 1) + cells.reshape(len(cells), -1)
+        chunk, node = np.divmod(np.unique(pairs), nodes + 1)
+        chunk, node = chunk[node < nodes], node[node < nodes]
+        at = np.searchsorted(ranges, node, side="right")
+        touches, touched = np.divmod(np.unique(chunk * len(ranges) + at), len(ranges))
+        back = np.argsort(touched, kind="stable")
+        self._arrays: dict[str, npt.NDArray[Any]] = {
+            "awake": np.zeros(chunks, np.uint8), "near": np.zeros(chunks, np.uint8),
+            "stirred": np.zeros(len(ranges), np.uint8), "size": size,
+            "node_from": np.searchsorted(chunk, np.arange(chunks + 1)),
+            "node": node.astype(np.int32),
+            "range_from": np.searchsorted(touches, np.arange(chunks + 1)),
+            "range": touched.astype(np.int32),
+            "chunk_from": np.searchsorted(touched[back], np.arange(len(ranges) + 1)),
+            "chunk": touches[back].astype(np.int32),
+        }  # fmt: skip
+        for name, array in self._arrays.items():
+            setattr(self.state, name, array.ctypes.data)
+        moved = np.searchsorted(ranges, np.flatnonzero(stirred), side="right")
+        moved = np.unique(np.concatenate([moved, always])).astype(np.int64)
+        this = ctypes.byref(self.state)
+        c.cb_stir(this, ctypes.c_int64(len(moved)), ctypes.c_void_p(moved.ctypes.data))
+        rows = np.flatnonzero(awake).astype(np.int64)
+        c.cb_wake(this, ctypes.c_int64(len(rows)), ctypes.c_void_p(rows.ctypes.data))
+
+    @property
+    def skipped(self) -> int:
+        """Cell updates skipped so far."""
+        return int(self.state.skipped)
+
+
+def active(cells: npt.NDArray[np.int32], stirred: Flags) -> float:
+    """Share of the blocks that have a stirred node; cells (blocks, d + 1, W), padding counts not."""
+    if not len(cells):
+        return 1.0
+    return float(np.mean(np.append(stirred, False)[cells].any(axis=(1, 2))))
