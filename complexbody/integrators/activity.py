@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from complexbody import native
+
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
@@ -57,35 +59,26 @@ class Activity:
         stirred: Flags, awake: Flags, always: Ints,
     ) -> None:  # fmt: skip
         chunks, nodes = len(blocks), int(ranges[-1])
-        firsts = np.concatenate([[0], blocks[:-1]]).astype(np.int64)
-        of_block = np.repeat(np.arange(chunks), blocks - firsts)
-        real = cells[:, 0, :] < nodes
-        size = np.bincount(of_block, weights=real.sum(axis=1), minlength=chunks).astype(np.int64)
+        ends = np.concatenate([[0], blocks]).astype(np.int64)
+        size = np.add.reduceat((cells[:, 0, :] < nodes).sum(axis=1), ends[:-1]).astype(np.int64)
         self.state = State(1, chunks, int(size.sum()))
-        pairs = of_block[:, None] * (nodes + 1) + cells.reshape(len(cells), -1)
-        chunk, node = np.divmod(np.unique(pairs), nodes + 1)
-        chunk, node = chunk[node < nodes], node[node < nodes]
-        at = np.searchsorted(ranges, node, side="right")
-        touches, touched = np.divmod(np.unique(chunk * len(ranges) + at), len(ranges))
+        node_from, node = _distinct(c, ends * cells[0].size, cells.ravel(), nodes)
+        place = np.searchsorted(ranges, np.arange(nodes), side="right").astype(np.int32)
+        range_from, touched = _distinct(c, node_from, place[node], len(ranges))
         back = np.argsort(touched, kind="stable")
         self._arrays: dict[str, npt.NDArray[Any]] = {
             "awake": np.zeros(chunks, np.uint8), "near": np.zeros(chunks, np.uint8),
-            "stirred": np.zeros(len(ranges), np.uint8), "size": size,
-            "node_from": np.searchsorted(chunk, np.arange(chunks + 1)),
-            "node": node.astype(np.int32),
-            "range_from": np.searchsorted(touches, np.arange(chunks + 1)),
-            "range": touched.astype(np.int32),
+            "stirred": np.zeros(len(ranges), np.uint8), "size": size, "node_from": node_from,
+            "node": node, "range_from": range_from, "range": touched,
             "chunk_from": np.searchsorted(touched[back], np.arange(len(ranges) + 1)),
-            "chunk": touches[back].astype(np.int32),
+            "chunk": np.repeat(np.arange(chunks), np.diff(range_from))[back].astype(np.int32),
         }  # fmt: skip
         for name, array in self._arrays.items():
             setattr(self.state, name, array.ctypes.data)
-        moved = np.searchsorted(ranges, np.flatnonzero(stirred), side="right")
-        moved = np.unique(np.concatenate([moved, always])).astype(np.int64)
-        this = ctypes.byref(self.state)
-        c.cb_stir(this, ctypes.c_int64(len(moved)), ctypes.c_void_p(moved.ctypes.data))
-        rows = np.flatnonzero(awake).astype(np.int64)
-        c.cb_wake(this, ctypes.c_int64(len(rows)), ctypes.c_void_p(rows.ctypes.data))
+        moved = np.unique(np.concatenate([place[stirred], always])).astype(np.int64)
+        rows, this = np.flatnonzero(awake).astype(np.int64), ctypes.byref(self.state)
+        c.cb_stir(this, ctypes.c_int64(len(moved)), native.pointer(moved))
+        c.cb_wake(this, ctypes.c_int64(len(rows)), native.pointer(rows))
 
     @property
     def skipped(self) -> int:
@@ -93,8 +86,21 @@ class Activity:
         return int(self.state.skipped)
 
 
+def _distinct(
+    c: ctypes.CDLL, start: Ints, values: npt.NDArray[np.int32], most: int
+) -> tuple[Ints, npt.NDArray[np.int32]]:
+    """(starts, values) of the distinct values below ``most`` of each group of values."""
+    starts, scratch = np.zeros(len(start), np.int64), np.zeros(most, np.int32)
+    out = np.empty(len(values), np.int32)
+    c.cb_distinct(
+        ctypes.c_int64(len(start) - 1), native.pointer(start), native.pointer(values),
+        ctypes.c_int32(most), native.pointer(scratch), native.pointer(starts), native.pointer(out),
+    )  # fmt: skip
+    return starts, out[: starts[-1]].copy()
+
+
 def active(cells: npt.NDArray[np.int32], stirred: Flags) -> float:
     """Share of the blocks that have a stirred node; cells (blocks, d + 1, W), padding counts not."""
     if not len(cells):
         return 1.0
-    return float(np.mean(np.append(stirred, False)[cells].any(axis=(1, 2))))
+    return float(np.mean(np.append(stirred, False)[cells].reshape(len(cells), -1).any(axis=1)))

@@ -188,8 +188,10 @@ class LocalLeapfrogRun(SynchronousRun):
         self._driven = problem.comm.allreduce(len(problem.moving[0])) > 0
         self._loaded = problem.comm.allreduce(len(problem.load_value)) > 0
         self._messages: list[octaves.Message] = []
-        if self.levels:
+        if self.levels:  # octaves act on all their cells
             self._make(method, plan.level[disc.dof])
+        else:
+            self.watch()
 
     def _make(self, method: LocalLeapfrog, level: octaves.Ints) -> None:
         problem, kernels, L = self.problem, self.problem.kernels, self.levels
@@ -225,11 +227,6 @@ class LocalLeapfrogRun(SynchronousRun):
         self._coarse = native.pointer(table.chunks), ctypes.c_int64(int(table.start[1]))
         if problem.comm.size > 1:
             self._messages = [octaves.Message(problem, table.touched[:, i]) for i in range(L + 1)]
-
-    def _watch(self) -> None:
-        """Octaves act on all their cells: only a run without any skips quiet ones."""
-        if not self.levels:
-            super()._watch()
 
     def _softness(self) -> Array:
         """(Δt²/2) M̂⁻¹ on free components per class: how far a unit force moves in a step."""

@@ -81,22 +81,19 @@ class SynchronousRun(ForceRun):
         self._own = State.from_buffer_copy(s)
         self.state = ctypes.byref(self._own)
 
-    def _watch(self) -> None:
-        """From now on skip what is quiet, if enough is; f must be its constant part."""
+    def watch(self) -> None:
+        """Skip what is quiet from now on, if enough is; before the first step."""
         problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
         if not (problem.quiet and disc.blocks):
             return
-        stirred = (kernels.x[:-1] != 0).any(axis=1) | (kernels.v[:-1] != 0).any(axis=1)
-        stirred |= (kernels.f[:-1] != 0).any(axis=1)
+        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
+        stirred = (stirred | (kernels.f[:-1, : disc.n] != 0)).any(axis=1)
         stirred[problem.load_position // disc.record] = True
         if active(disc.cells, stirred) > ENOUGH:
             return
         awake, energetic = kernels.restless()
-        ends = np.append(disc.chunks[:, 3], disc.nodes)
-        late = np.array([len(disc.chunks)])
-        self.activity = Activity(
-            self.c, disc.chunks[:, 1], disc.cells, ends, stirred, awake, late
-        )
+        ends, late = np.append(disc.chunks[:, 3], disc.nodes), np.array([len(disc.chunks)])
+        self.activity = Activity(self.c, disc.chunks[:, 1], disc.cells, ends, stirred, awake, late)
         self._own.activity = ctypes.addressof(self.activity.state)
         self.watched = None if energetic else self._own
         self.c.cb_look(self.state)
@@ -193,24 +190,29 @@ class SynchronousRun(ForceRun):
         self.forces()
         n, weight = disc.n, 0.5 if self.method.start == "trapezoidal" else 1.0
         v0 = problem.rates_at_start(1e-3 * self.step)
-        klass = problem.masses.classes[:-1]
         f = kernels.f[:-1, :n] * kernels.inverse_volume[:, None]
-        v1 = np.einsum("aij,aj->ai", rec.from_rate[klass], v0)
-        v1 += weight * np.einsum("aij,aj->ai", rec.beta[klass], f)
+        v1 = np.zeros_like(v0)
+        moves = ((v0 != 0) | (f != 0)).any(axis=1)
+        moves[problem.moving[0]] = True
+        at = np.flatnonzero(moves)  # all others stay at rest
+        klass = problem.masses.classes[at]
+        v1[at] = np.einsum("aij,aj->ai", rec.from_rate[klass], v0[at])
+        v1[at] += weight * np.einsum("aij,aj->ai", rec.beta[klass], f[at])
         rows, columns = problem.moving
         if len(rows):
             v1[rows, columns] = (problem.targets(self.step) - kernels.x[rows, columns]) / self.step
         both, owned = v0 + v1, disc.owned
         # Half a step: (M̂ + hD/2)v⁺ − Mq̇₀ = (h/2)f times the mean of its ends' rates balances
         # ½v⁺·M̂v⁺ − ½q̇₀·Mq̇₀ (also where hη ≫ ρ̄) with the works of loads and supports.
-        lost = np.einsum("ai,aij,aj->a", v0, (self.mean - self.mass)[klass], v1)
-        lost += 0.5 * self.step * np.einsum("ai,aij,aj->a", both, self.eta[klass], v1)
-        kernels.sums[0] += 0.5 * np.sum(lost * disc.volume * owned)
+        lost = np.einsum("ai,aij,aj->a", v0[at], (self.mean - self.mass)[klass], v1[at])
+        lost += 0.5 * self.step * np.einsum("ai,aij,aj->a", both[at], self.eta[klass], v1[at])
+        kernels.sums[0] += 0.5 * np.sum(lost * (disc.volume * owned)[at])
         amplitude = self.amplitude(0.0)
         full = np.zeros_like(kernels.v)
         full[:-1, :n] = both
         kernels.sums[3] += self.step / 4 * problem.load_power(amplitude, full)
         if len(rows):
+            klass = problem.masses.classes[:-1]
             momentum = np.einsum("aij,aj->ai", (self.mean + 0.5 * self.step * self.eta)[klass], v1)
             momentum -= np.einsum("aij,aj->ai", self.mass[klass], v0)
             impulse = disc.volume[:, None] * (momentum - weight * self.step * f)
@@ -223,7 +225,7 @@ class SynchronousRun(ForceRun):
         kernels.x[:-1, :n] += self.step * v1
         kernels.reset_forces()
         self.steps, self.ready = 1, False
-        self._watch()
+        self.c.cb_look(self.state)
 
     # --- what a user sees at t_n -------------------------------------------------------------
 

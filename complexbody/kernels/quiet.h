@@ -55,3 +55,21 @@ void cb_stir(activity *q, int64_t count, const int64_t *range) {
 void cb_wake(activity *q, int64_t count, const int64_t *chunk) {
   for (int64_t i = 0; i < count; i++) wake(q, chunk[i]);
 }
+
+/* The distinct values below `most` of each group values[from[g] .. from[g + 1]), in the order met, into
+ * `out`; stamp[most] is scratch. */
+void cb_distinct(int64_t groups, const int64_t *from, const int32_t *values, int32_t most,
+                    int32_t *stamp, int64_t *out_from, int32_t *out) {
+  int64_t count = 0;
+  memset(stamp, 0, most * sizeof *stamp);
+  for (int64_t g = 0; g < groups; g++) {
+    out_from[g] = count;
+    for (int64_t i = from[g]; i < from[g + 1]; i++) {
+      const int32_t v = values[i];
+      if (v >= most || stamp[v] == g + 1) continue;
+      stamp[v] = (int32_t)(g + 1);
+      out[count++] = v;
+    }
+  }
+  out_from[groups] = count;
+}
