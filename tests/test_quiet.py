@@ -85,6 +85,9 @@ def small_chunks(monkeypatch):
 
 METHODS = {
     "synchronous": (cb.Synchronous(), 10),
+    "balanced": (cb.AVI(), 5),
+    "plain": (cb.AVI(balanced=False), 5),
+    "one-sided": (cb.AVI(balanced=False, start="one-sided", dissipation="forward"), 5),
 }
 
 

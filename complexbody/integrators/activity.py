@@ -37,6 +37,25 @@ class State(ctypes.Structure):
     )  # fmt: skip
 
 
+class Counted:
+    """Cell updates of a run on this rank.
+
+    Attributes:
+        updates, skipped: Done, and those of quiet cells, which were not needed.
+        activity: Which cells are quiet; None if that is not watched for.
+    """
+
+    updates: int = 0
+    skipped: int = 0
+    activity: Activity | None = None
+
+    def _count(self, due: int) -> None:
+        """Of so many cell updates that were due, count those done and those skipped."""
+        saved = 0 if self.activity is None else self.activity.skipped - self.skipped
+        self.skipped += saved
+        self.updates += due - saved
+
+
 class Activity:
     """Chunks of cells and ranges of nodes, and what is awake of them.
 
@@ -51,6 +70,7 @@ class Activity:
 
     Attributes:
         state: What the C functions read.
+        blocks: Blocks of each chunk (chunks,); flags: Which are awake or near, and ranges stirred.
         skipped: Cell updates skipped so far.
     """
 
@@ -66,10 +86,12 @@ class Activity:
         place = np.searchsorted(ranges, np.arange(nodes), side="right").astype(np.int32)
         range_from, touched = _distinct(c, node_from, place[node], len(ranges))
         back = np.argsort(touched, kind="stable")
+        self.blocks = np.diff(ends)
+        counts = {"awake": chunks, "near": chunks, "stirred": len(ranges)}
+        self.flags = {name: np.zeros(count, np.uint8) for name, count in counts.items()}
         self._arrays: dict[str, npt.NDArray[Any]] = {
-            "awake": np.zeros(chunks, np.uint8), "near": np.zeros(chunks, np.uint8),
-            "stirred": np.zeros(len(ranges), np.uint8), "size": size, "node_from": node_from,
-            "node": node, "range_from": range_from, "range": touched,
+            **self.flags, "size": size, "node_from": node_from, "node": node, 
+            "range_from": range_from, "range": touched,
             "chunk_from": np.searchsorted(touched[back], np.arange(len(ranges) + 1)),
             "chunk": np.repeat(np.arange(chunks), np.diff(range_from))[back].astype(np.int32),
         }  # fmt: skip
@@ -100,7 +122,7 @@ def _distinct(
 
 
 def active(cells: npt.NDArray[np.int32], stirred: Flags) -> float:
-    """Share of the blocks that have a stirred node; cells (blocks, d + 1, W), padding counts not."""
+    """Share of blocks that have a stirred node, of cells (blocks, d + 1, W)."""
     if not len(cells):
         return 1.0
     return float(np.mean(np.append(stirred, False)[cells].reshape(len(cells), -1).any(axis=1)))

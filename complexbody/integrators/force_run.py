@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody import native
+from complexbody.integrators.activity import Counted
 from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
 
 
-class ForceRun:
+class ForceRun(Counted):
     """A run with one step for all cells.
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
-        updates, skipped: Cell updates done by this rank, and of quiet cells, not needed.
         ready: Whether f holds the forces at (x_n, t_n).
         time_sets: None: all act together.
     """
@@ -29,7 +29,7 @@ class ForceRun:
 
     def __init__(self, problem: Problem, step: float, critical: float) -> None:
         self.problem, self.step, self.critical = problem, step, critical
-        self.steps, self.updates, self.skipped, self.ready = 0, 0, 0, False
+        self.steps, self.ready = 0, False
         self.state = ctypes.byref(problem.kernels.state)
 
     @property
@@ -51,16 +51,6 @@ class ForceRun:
             self._exchange_begin()
             self._exchange_end()
         self.ready = True
-
-    def _count(self, updates: int) -> None:
-        """Of so many cell updates due, count those done and those that quiet cells saved."""
-        saved = self.saved() - self.skipped
-        self.skipped += saved
-        self.updates += updates - saved
-
-    def saved(self) -> int:
-        """Cell updates of quiet cells so far: none, unless a run watches for them."""
-        return 0
 
     def amplitude(self, t: float) -> Array:
         """Factors of the loads' groups at t [s]."""

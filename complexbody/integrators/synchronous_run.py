@@ -34,8 +34,6 @@ class SynchronousRun(ForceRun):
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
-        updates, skipped: Cell updates done by this rank, and of quiet cells, not needed.
-        activity: Which cells are quiet; None if that is not watched for.
         watched: What the C functions read, with the activity in it; None if energies of quiet cells
             are not zero.
         support_work: Work of this rank's moving supports in the half step before a sample [J].
@@ -49,7 +47,6 @@ class SynchronousRun(ForceRun):
             self._refuse_partial()
         kernels.select(masses.diagonal, masses.damped)
         self.c = kernels.c
-        self.activity: Activity | None = None
         self.watched: State | None = None
         rec = masses.recursion(step, method.dissipation)
         if method.start == "one-sided":
@@ -97,10 +94,6 @@ class SynchronousRun(ForceRun):
         self._own.activity = ctypes.addressof(self.activity.state)
         self.watched = None if energetic else self._own
         self.c.cb_look(self.state)
-
-    def saved(self) -> int:
-        """Cell updates of quiet cells so far."""
-        return 0 if self.activity is None else self.activity.skipped
 
     def _refuse_partial(self) -> None:
         n_u, (rows, columns) = self.problem.scene.displacement, self.problem.moving

@@ -183,9 +183,8 @@ class Kernels:
                     f" tabulated_energy(s->forms + {3 * r + 2}, {common}, out + 1); break;"
                 )
                 for i, what in ((0, "force"), (1, "energy"), (2, "energy")):
-                    rest.append(
-                        f"if (region == {r}) tabulated_rest(s->forms + {3 * r + i}, {common}, {what});"
-                    )
+                    call = f"tabulated_rest(s->forms + {3 * r + i}, {common}, {what})"
+                    rest.append(f"if (region == {r}) {call};")
         arguments = "region, blocks, first, c, g, k, s"
         parts.append(f"#define FORCE({arguments}) switch (region) {{ {' '.join(force)} }}")
         parts.append(f"#define ENERGY({arguments}, out) switch (region) {{ {' '.join(energy)} }}")
