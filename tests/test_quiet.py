@@ -10,9 +10,12 @@ from harness import everywhere
 
 import complexbody as cb
 from complexbody import discretisation, meshes
+from complexbody.forms import isotropic_two_field, scaled_icosahedral_quasicrystal
+from complexbody.integrators import windows
+from complexbody.kernels import events
 from complexbody.scene import FIELDS
 
-CELLS = {1: 240, 2: (48, 5), 3: (16, 3, 2)}
+CELLS = {1: 240, 2: (48, 5), 3: (24, 2, 2)}
 PATCH = lambda x: (x[0] < 1e-9) & (x[1] < 0.12)  # noqa: E731
 
 
@@ -43,8 +46,12 @@ def bar(comm, dim, source, kind="numbers", extra=None, potential=None):
         mesh = meshes.jiggled(meshes.rectangle(comm, (0, 0), (1, 0.1), CELLS[2]), 0.2)
     else:
         mesh = meshes.jiggled(meshes.box(comm, (0, 0, 0), (1, 0.2, 0.1), CELLS[3]), 0.15)
-    n_u, k = (3 if dim == 3 else 2), 2
-    base = quadratic(random_hessian(10 * dim, n_u, k, dim), dim)
+    n_u, k = (3, 3) if dim == 3 else (2, 2)
+    base = {
+        1: quadratic(random_hessian(10, n_u, k, dim), dim),
+        2: isotropic_two_field(d=2).energy,
+        3: scaled_icosahedral_quasicrystal().energy,
+    }[dim]
 
     def energy(U, nu, N):
         return base(U, nu, N) + (extra(U, nu) if extra else 0.0)
@@ -81,38 +88,41 @@ def pair(comm, scene, method, steps, **given):
 def small_chunks(monkeypatch):
     """Bodies of some hundred cells must have some dozen chunks."""
     monkeypatch.setattr(discretisation, "BLOCKS_PER_CHUNK", 2)
+    for module in (events, windows):
+        monkeypatch.setattr(module, "CHUNK", 2)
 
 
 METHODS = {
     "synchronous": (cb.Synchronous(), 10),
-    "balanced": (cb.AVI(), 5),
-    "plain": (cb.AVI(balanced=False), 5),
-    "one-sided": (cb.AVI(balanced=False, start="one-sided", dissipation="forward"), 5),
+    "balanced": (cb.AVI(), 4),
+    "plain": (cb.AVI(balanced=False), 4),
+    "one-sided": (cb.AVI(balanced=False, start="one-sided", dissipation="forward"), 4),
 }
+SOME = ["synchronous", "balanced"]
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("dim", [1, 2, 3])
+@pytest.mark.parametrize("dim, method", [(1, "one-sided"), (2, "synchronous"), (2, "balanced"),
+                                         (2, "plain"), (3, "synchronous"), (3, "balanced")])
 def test_point_pulse(comm, dim, method):
     """A pulse that enters at one end pays for what it has reached."""
     assert pair(comm, bar(comm, dim, "traction"), *METHODS[method], ledger_steps=3) > 0.6
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", ["synchronous", "balanced", "plain"])
 @pytest.mark.parametrize("source", ["later", "force", "bump", "support", "held"])
 def test_sources(comm, source, method):
-    """Whatever sets cells moving: loads not yet at work, initial data, supports that move or not."""
-    assert pair(comm, bar(comm, 2, source), *METHODS[method]) > 0.3
+    """Whatever sets cells moving: loads, at work or not yet, initial data, supports."""
+    assert pair(comm, bar(comm, 1, source), *METHODS[method]) > 0.4
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_until_all_is_awake(comm, method):
     """A run that starts quiet and ends with all cells awake, long after the watch is given up."""
     integrator, steps = METHODS[method]
-    assert 0 < pair(comm, bar(comm, 2, "bump"), integrator, 10 * steps) < 0.6
+    assert 0 < pair(comm, bar(comm, 2, "bump"), integrator, 8 * steps) < 0.6
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SOME)
 def test_nothing_happens(comm, method):
     """A body at rest stays there, and costs nothing."""
     assert pair(comm, bar(comm, 1, "nothing"), *METHODS[method]) == 1.0
@@ -127,19 +137,21 @@ def test_viscosity(comm, kind, scheme):
     for start in ("trapezoidal", "one-sided"):
         method = cb.Synchronous(dissipation=scheme, start=start)
         assert pair(comm, bar(comm, 1, "bump", kind), method, 8) > 0.4
+    slow = cb.AVI(balanced=kind != "blocks", dissipation=scheme)
+    assert pair(comm, bar(comm, 1, "bump", kind), slow, 3) > 0.4
 
 
 def quartic(U, nu):
     return nu[0] ** 4 + U[0, 0] ** 2 * nu[1] ** 2
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SOME)
 def test_any_density(comm, method):
     """A density that is not quadratic has no force at zero either: checked by evaluating it."""
     assert pair(comm, bar(comm, 1, "traction", extra=quartic), *METHODS[method]) > 0.6
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SOME)
 @pytest.mark.parametrize("extra", [
     lambda U, nu: 0.3 * U[0, 0] - 0.2 * nu[1],
     lambda U, nu: 0.3 * U[0, 0] - 0.2 * nu[1] + quartic(U, nu),
@@ -149,7 +161,7 @@ def test_prestress(comm, extra, method):
     assert pair(comm, bar(comm, 1, "traction", extra=extra), *METHODS[method]) == 0.0
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SOME)
 def test_potential(comm, method):
     """A potential of external actions: of second order it acts on what moves, of first on all."""
     soft = bar(comm, 1, "traction", potential=lambda u, nu: 0.4 * (u[0] + nu[1]) ** 2 + 1.5)
@@ -158,12 +170,12 @@ def test_potential(comm, method):
     assert pair(comm, pulled, *METHODS[method]) == 0.0
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SOME)
 def test_everything_at_once(comm, method):
     """Where all cells are awake from the start nothing is watched."""
-    assert pair(comm, bar(comm, 2, "everywhere"), *METHODS[method]) == 0.0
-    assert pair(comm, busy(comm, 2, "numbers"), *METHODS[method]) == 0.0
-    run = prepared(busy(comm, 2, "numbers"), METHODS[method][0])
+    assert pair(comm, bar(comm, 1, "everywhere"), *METHODS[method]) == 0.0
+    assert pair(comm, busy(comm, 1, "numbers"), *METHODS[method]) == 0.0
+    run = prepared(busy(comm, 1, "numbers"), METHODS[method][0])
     assert run.activity is None
 
 

@@ -90,7 +90,7 @@ class Activity:
         counts = {"awake": chunks, "near": chunks, "stirred": len(ranges)}
         self.flags = {name: np.zeros(count, np.uint8) for name, count in counts.items()}
         self._arrays: dict[str, npt.NDArray[Any]] = {
-            **self.flags, "size": size, "node_from": node_from, "node": node, 
+            **self.flags, "size": size, "node_from": node_from, "node": node,
             "range_from": range_from, "range": touched,
             "chunk_from": np.searchsorted(touched[back], np.arange(len(ranges) + 1)),
             "chunk": np.repeat(np.arange(chunks), np.diff(range_from))[back].astype(np.int32),

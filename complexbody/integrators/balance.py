@@ -83,8 +83,9 @@ def coupling(problem: Problem, number: int) -> Array:
     cells = np.argwhere(problem.disc.source_cell[mine] >= 0)
     cells = cells[:: len(cells) // 1000 + 1]
     if not kernels.densities.generated[number]:
-        m = initial_matrices(problem, number).reshape(*problem.disc.source_cell[mine].shape, -1)
-        local = m[tuple(cells.T)].reshape(len(cells), -1, n, problem.disc.dim + 1, n)
+        d = problem.disc.dim + 1  # a rank may have no cell of this region
+        shape = *problem.disc.source_cell[mine].shape, d, n, d, n
+        local = initial_matrices(problem, number).reshape(shape)[tuple(cells.T)]
         size = np.linalg.norm(local, axis=(1, 3))
         pairs = [(size, size, size)]
     else:
