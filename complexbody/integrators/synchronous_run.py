@@ -182,40 +182,40 @@ class SynchronousRun(ForceRun):
         )  # fmt: skip
         self.forces()
         n, weight = disc.n, 0.5 if self.method.start == "trapezoidal" else 1.0
-        v0 = problem.rates_at_start(1e-3 * self.step)
-        f = kernels.f[:-1, :n] * kernels.inverse_volume[:, None]
-        v1 = np.zeros_like(v0)
-        moves = ((v0 != 0) | (f != 0)).any(axis=1)
+        rates = problem.rates_at_start(1e-3 * self.step)
+        moves = ((rates != 0) | (kernels.f[:-1, :n] != 0)).any(axis=1)
         moves[problem.moving[0]] = True
         at = np.flatnonzero(moves)  # all others stay at rest
-        klass = problem.masses.classes[at]
-        v1[at] = np.einsum("aij,aj->ai", rec.from_rate[klass], v0[at])
-        v1[at] += weight * np.einsum("aij,aj->ai", rec.beta[klass], f[at])
+        v0, klass = rates[at], problem.masses.classes[at]
+        volume, owned = disc.volume[at], disc.owned[at]
+        f = kernels.f[at, :n] * kernels.inverse_volume[at, None]
+        v1 = np.einsum("aij,aj->ai", rec.from_rate[klass], v0)
+        v1 += weight * np.einsum("aij,aj->ai", rec.beta[klass], f)
         rows, columns = problem.moving
+        moving = np.searchsorted(at, rows), columns
         if len(rows):
-            v1[rows, columns] = (problem.targets(self.step) - kernels.x[rows, columns]) / self.step
-        both, owned = v0 + v1, disc.owned
+            v1[moving] = (problem.targets(self.step) - kernels.x[rows, columns]) / self.step
+        both = v0 + v1
         # Half a step: (M̂ + hD/2)v⁺ − Mq̇₀ = (h/2)f times the mean of its ends' rates balances
         # ½v⁺·M̂v⁺ − ½q̇₀·Mq̇₀ (also where hη ≫ ρ̄) with the works of loads and supports.
-        lost = np.einsum("ai,aij,aj->a", v0[at], (self.mean - self.mass)[klass], v1[at])
-        lost += 0.5 * self.step * np.einsum("ai,aij,aj->a", both[at], self.eta[klass], v1[at])
-        kernels.sums[0] += 0.5 * np.sum(lost * (disc.volume * owned)[at])
-        amplitude = self.amplitude(0.0)
-        full = np.zeros_like(kernels.v)
-        full[:-1, :n] = both
-        kernels.sums[3] += self.step / 4 * problem.load_power(amplitude, full)
+        lost = np.einsum("ai,aij,aj->a", v0, (self.mean - self.mass)[klass], v1)
+        lost += 0.5 * self.step * np.einsum("ai,aij,aj->a", both, self.eta[klass], v1)
+        kernels.sums[0] += 0.5 * np.sum(lost * volume * owned)
+        self.scratch[:] = 0.0
+        self.scratch[at, :n] = both
+        power = problem.load_power(self.amplitude(0.0), self.scratch)
+        kernels.sums[3] += self.step / 4 * power
         if len(rows):
-            klass = problem.masses.classes[:-1]
             momentum = np.einsum("aij,aj->ai", (self.mean + 0.5 * self.step * self.eta)[klass], v1)
             momentum -= np.einsum("aij,aj->ai", self.mass[klass], v0)
-            impulse = disc.volume[:, None] * (momentum - weight * self.step * f)
-            kernels.sums[4] += (0.5 * impulse * both * owned[:, None])[rows, columns].sum()
-        jump = np.abs(v1 - v0) * (disc.volume * owned)[:, None]
+            impulse = volume[:, None] * (momentum - weight * self.step * f)
+            kernels.sums[4] += (0.5 * impulse * both * owned[:, None])[moving].sum()
+        jump = np.abs(v1 - v0) * (volume * owned)[:, None]
         n_u = problem.scene.displacement
         kernels.sums[1] += jump[:, :n_u].sum()
         kernels.sums[2] += jump[:, n_u:].sum()
-        kernels.v[:-1, :n] = v1
-        kernels.x[:-1, :n] += self.step * v1
+        kernels.v[at, :n] = v1
+        kernels.x[at, :n] += self.step * v1
         kernels.reset_forces()
         self.steps, self.ready = 1, False
         self.c.cb_look(self.state)
