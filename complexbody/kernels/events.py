@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 #: Blocks of cells whose nodes drift together before the cells act: less than an L1 cache full.
 CHUNK = 8
 #: Nodes that are moved to a window's end together, or are quiet together; a multiple of W.
-RANGE = 32
+RANGE = 16
 
 
 def regions(kernels: Kernels) -> list[EventSource | None]:
