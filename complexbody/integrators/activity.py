@@ -102,6 +102,10 @@ class Activity:
         c.cb_stir(this, ctypes.c_int64(len(moved)), native.pointer(moved))
         c.cb_wake(this, ctypes.c_int64(len(rows)), native.pointer(rows))
 
+    def stop(self) -> None:
+        """All cells act from now on: for who changes a run's state by hand."""
+        self.state.on = 0
+
     @property
     def skipped(self) -> int:
         """Cell updates skipped so far."""

@@ -29,6 +29,8 @@ def window_map(run):
     A cell's forces are those of some displacement of its nodes: of all others it never holds any.
     """
     problem, balance = run.problem, run.balance
+    if run.activity is not None:
+        run.activity.stop()  # cells at rest are set moving by hand
     disc, n, record = problem.disc, problem.disc.n, problem.disc.record
     rows, columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
     size, held = len(rows), []
