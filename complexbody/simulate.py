@@ -56,7 +56,8 @@ def simulate(
             per cent of the run, but at least a hundred rows.
         growth: Stop when energy from nowhere exceeds this multiple of what was put in; None: never.
         progress: Show progress on rank 0; by default where standard error is a terminal.
-        quiet: Skip cells at rest that nothing has reached yet: the same results to the bit.
+        quiet: Skip cells at rest that nothing has reached yet: the same results to the bit
+            (``Synchronous`` and windows of ``AVI``; the others act on all cells).
 
     Returns:
         Fields at the final time, ledger, probes and statistics.

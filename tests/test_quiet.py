@@ -108,14 +108,17 @@ def test_point_pulse(comm, dim, method):
     assert pair(comm, bar(comm, dim, "traction"), *METHODS[method], ledger_steps=3) > 0.6
 
 
-@pytest.mark.parametrize("method", ["synchronous", "balanced", "plain"])
-@pytest.mark.parametrize("source", ["later", "force", "bump", "support", "held"])
+@pytest.mark.parametrize("source, method", [
+    *((source, "synchronous") for source in ("later", "force", "bump", "support", "held")),
+    *((source, "balanced") for source in ("force", "bump", "support")),
+    *((source, "plain") for source in ("later", "support", "held")),
+])  # fmt: skip
 def test_sources(comm, source, method):
     """Whatever sets cells moving: loads, at work or not yet, initial data, supports."""
     assert pair(comm, bar(comm, 1, source), *METHODS[method]) > 0.4
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", SOME)
 def test_until_all_is_awake(comm, method):
     """A run that starts quiet and ends with all cells awake, long after the watch is given up."""
     integrator, steps = METHODS[method]
@@ -128,16 +131,16 @@ def test_nothing_happens(comm, method):
     assert pair(comm, bar(comm, 1, "nothing"), *METHODS[method]) == 1.0
 
 
-@pytest.mark.parametrize("kind", ["numbers", "blocks", "no inertia"])
-@pytest.mark.parametrize("scheme", ["exact", "symmetric", "forward"])
-def test_viscosity(comm, kind, scheme):
+@pytest.mark.parametrize("kind, scheme, start", [
+    ("numbers", "exact", "one-sided"), ("numbers", "symmetric", "trapezoidal"),
+    ("blocks", "exact", "trapezoidal"), ("blocks", "forward", "one-sided"),
+    ("no inertia", "exact", "trapezoidal"), ("no inertia", "forward", "one-sided"),
+])  # fmt: skip
+def test_viscosity(comm, kind, scheme, start):
     """All dissipation schemes, with inertia and viscosity in blocks, and without inertia."""
-    if kind == "no inertia" and scheme == "symmetric":
-        pytest.skip("has no limit without inertia")
-    for start in ("trapezoidal", "one-sided"):
-        method = cb.Synchronous(dissipation=scheme, start=start)
-        assert pair(comm, bar(comm, 1, "bump", kind), method, 8) > 0.4
-    slow = cb.AVI(balanced=kind != "blocks", dissipation=scheme)
+    method = cb.Synchronous(dissipation=scheme, start=start)
+    assert pair(comm, bar(comm, 1, "bump", kind), method, 8) > 0.4
+    slow = cb.AVI(balanced=kind == "numbers", dissipation=scheme)
     assert pair(comm, bar(comm, 1, "bump", kind), slow, 3) > 0.4
 
 
