@@ -43,6 +43,8 @@ class RunMap:
     def __init__(self, run: Any, spans: int = 1) -> None:
         self.run, self.spans = run, spans
         problem = run.problem
+        if getattr(run, "activity", None) is not None:
+            run.activity.stop()  # cells at rest are set moving by hand
         self._rows, self._columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
         self.free = len(self._rows)
         self._held: list[tuple[int, int, Array]] = []
@@ -107,7 +109,7 @@ class RunMap:
                 run.balance.held[block, :, lane] += part * basis
                 nodes = disc.cells[block, :, lane]
                 np.add.at(total[:, :n], nodes, part * basis.reshape(-1, n))
-        run.c.cb_accelerate(run._world, native.pointer(total))
+        run.c.cb_accelerate(run._world, native.pointer(total), *run._all)
 
 
 def force_basis(run: WindowRun, block: int, lane: int) -> Array:

@@ -57,6 +57,7 @@ class Problem:
             the lower bound γI in its place.
         convexity, kinetic_range: Of general χ: how γ, Ξ and T₀ are measured (None if there is no
             such χ), and what they are at the initial state.
+        quiet: Whether runs may skip cells at rest, which changes no bit.
         warnings: What A1 leaves to the boundary data, and locking, in words.
 
     Raises:
@@ -77,6 +78,7 @@ class Problem:
         self.start = boundary.initial(scene, self.action)
         self._read_inertia()
         self.node_step: float | Array = 0.0
+        self.quiet = True
         self.arrange()
         self.warnings = self._check_energy()
         self.live = Live(tuple(range(scene.components)), {}, scene.components)

@@ -26,7 +26,8 @@ class Statistics:
     Attributes:
         step, critical: Step and critical step [s]; steps: number of steps.
         cells, nodes: Of the whole body; ranks: processes.
-        updates: Cell updates of all ranks; rate: per second of stepping.
+        updates: Cell updates done by all ranks; rate: per second of stepping.
+        quiet: Share of cell updates that were skipped, since all nodes of these cells were at zero.
         set_up, stepping, booking, writing: Seconds of the slowest rank.
         bytes_per_cell: Memory beside dolfinx's own mesh.
     """
@@ -38,6 +39,7 @@ class Statistics:
     nodes: int = 0
     ranks: int = 1
     updates: int = 0
+    quiet: float = 0.0
     rate: float = 0.0
     set_up: float = 0.0
     stepping: float = 0.0

@@ -48,6 +48,7 @@ def simulate(
     growth: float | None = 10.0,
     progress: bool | None = None,
     plan: bool = True,
+    quiet: bool | None = None,
 ) -> Result:
     """Run a scene from t = 0 to ``until``; collective.
 
@@ -62,6 +63,8 @@ def simulate(
         growth: Stop when energy from nowhere exceeds this multiple of what was put in; None: never.
         progress: Show progress on rank 0; by default where standard error is a terminal.
         plan: Leave out what changes no result (:func:`complexbody.planning.plan`); False: nothing.
+        quiet: Skip cells at rest that nothing has reached yet: the same results to the bit
+            (``Synchronous`` and windows of ``AVI``; the others act on all cells).
 
     Returns:
         Fields at the final time, ledger, probes and statistics.
@@ -71,7 +74,7 @@ def simulate(
     """
     return Simulation(
         scene, integrator, until=until, output=output, ledger_steps=ledger_steps, growth=growth,
-        progress=progress, plan=plan,
+        progress=progress, plan=plan, quiet=quiet,
     ).run()  # fmt: skip
 
 
@@ -97,6 +100,7 @@ class Simulation:
         growth: float | None = 10.0,
         progress: bool | None = None,
         plan: bool = True,
+        quiet: bool | None = None,
     ) -> None:
         begun = clock.perf_counter()
         if not (np.isfinite(until) and until > 0):
@@ -109,6 +113,7 @@ class Simulation:
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
         warn_of(self.problem, method, until)
+        self.problem.quiet = plan if quiet is None else quiet
         self.run_: Run = method.prepare(self.problem, until)
         self.problem.release()
         self.plan = planning.of_run(self.problem, method) if plan else None
@@ -257,6 +262,8 @@ class Simulation:
         f, s = self.functions, self.stats
         s.steps = self.run_.steps
         s.updates = self.comm.allreduce(int(self.run_.updates))
+        skipped = self.comm.allreduce(int(self.run_.skipped))
+        s.quiet = skipped / max(s.updates + skipped, 1)
         for name in ("set_up", "stepping", "booking", "writing"):
             setattr(s, name, self.comm.allreduce(getattr(s, name), op=MPI.MAX))
         s.rate = s.updates / max(s.stepping, 1e-12)

@@ -83,8 +83,9 @@ def coupling(problem: Problem, number: int) -> Array:
     cells = np.argwhere(problem.disc.source_cell[mine] >= 0)
     cells = cells[:: len(cells) // 1000 + 1]
     if not kernels.densities.generated[number]:
-        m = initial_matrices(problem, number).reshape(*problem.disc.source_cell[mine].shape, -1)
-        local = m[tuple(cells.T)].reshape(len(cells), -1, n, problem.disc.dim + 1, n)
+        d = problem.disc.dim + 1  # a rank may have no cell of this region
+        shape = *problem.disc.source_cell[mine].shape, d, n, d, n
+        local = initial_matrices(problem, number).reshape(shape)[tuple(cells.T)]
         size = np.linalg.norm(local, axis=(1, 3))
         pairs = [(size, size, size)]
     else:
@@ -140,7 +141,7 @@ class Balance:
     def begin(self, t: float) -> None:
         """Forces half a step behind t, from positions and rates there: those of the first steps."""
         run, disc = self.run, self.run.problem.disc
-        run.c.cb_get_rates(run._world, native.pointer(run._rates))
+        run.c.cb_get_rates(run._world, native.pointer(run._rates), *run._all)
         q, rates = run.record[:, : disc.n].copy(), run._rates[:, : disc.n]
         run.record[:, 2 * disc.record : 3 * disc.record] = 0.0
         self._load[:] = 0.0
@@ -149,14 +150,15 @@ class Balance:
             run._together(t, BEGIN, first=i, last=i + 1, exchange=False)
         run.record[:, : disc.n] = q
         run._exchange(t)
-        run.updates += disc.count
+        run._count(disc.count)
 
     def load(self, t: float) -> None:
         """Loads at t act from now on, as a constant force."""
         run = self.run
-        run._force[:] = 0.0
-        run._add_loads(t)
-        run._sum_shared(run._force)
-        np.subtract(run._force, self._load, out=self._load)
-        run.c.cb_accelerate(run._world, native.pointer(self._load))
-        self._load[:] = run._force
+        if not run._loaded:
+            return
+        run._load_forces(t)
+        at = run.acted
+        self._load[at] = run._force[at] - self._load[at]
+        run.c.cb_accelerate(run._world, native.pointer(self._load), *run._some)
+        self._load[at] = run._force[at]

@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from complexbody import native
 from complexbody.integrators.timetable import TimeSets
+from complexbody.kernels.library import State
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
@@ -72,6 +73,7 @@ class Run(Protocol):
     Attributes:
         step, critical: Step (or window) and critical synchronous step [s].
         steps: Done so far; time: reached [s].
+        updates, skipped: Cell updates of this rank, and those that quiet cells saved.
     """
 
     step: float
@@ -81,6 +83,10 @@ class Run(Protocol):
     @property
     def updates(self) -> int:
         """Cell updates of this rank."""
+
+    @property
+    def skipped(self) -> int:
+        """Those that quiet cells saved."""
 
     @property
     def time(self) -> float:
@@ -106,26 +112,33 @@ class Run(Protocol):
         """Free communicators of the run's own."""
 
 
-def half_quadratic(problem: Problem, matrix: Array, w: Array, first: int, last: int) -> float:
-    """½ Σ_a V_a w·m w over this rank's nodes and components [first, last), m per class (n, n)."""
+def half_quadratic(
+    problem: Problem, matrix: Array, w: Array, first: int, last: int, state: State | None = None
+) -> float:
+    """½ Σ_a V_a w·m w over this rank's nodes and components [first, last), m per class (n, n).
+
+    A run that tracks which cells are quiet gives its own ``state``.
+    """
     kernels = problem.kernels
     return float(
         kernels.c.cb_quadratic(
-            ctypes.byref(kernels.state), native.pointer(matrix), native.pointer(w),
+            ctypes.byref(state or kernels.state), native.pointer(matrix), native.pointer(w),
             ctypes.c_int64(first), ctypes.c_int64(last),
         )
     )  # fmt: skip
 
 
-def energies(problem: Problem, mass: Array, rates: Array) -> dict[str, Any]:
+def energies(
+    problem: Problem, mass: Array, rates: Array, state: State | None = None
+) -> dict[str, Any]:
     """Kinetic, stored and potential energy and momentum of this rank at (kernels.x, rates)."""
     disc, masses = problem.disc, problem.masses
     n, n_u = disc.n, problem.scene.displacement
-    stored, potential = problem.kernels.energies().sum(axis=0)
+    stored, potential = problem.kernels.energies(state).sum(axis=0)
     weight = disc.volume * disc.owned * masses.density[masses.classes[:-1]]
     return {
-        "kinetic_u": half_quadratic(problem, mass, rates, 0, n_u),
-        "kinetic_nu": half_quadratic(problem, mass, rates, n_u, n),
+        "kinetic_u": half_quadratic(problem, mass, rates, 0, n_u, state),
+        "kinetic_nu": half_quadratic(problem, mass, rates, n_u, n, state),
         "stored": float(stored),
         "potential": float(potential),
         "momentum": weight @ rates[:-1, :n_u],

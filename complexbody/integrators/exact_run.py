@@ -52,23 +52,21 @@ class ExactRun(RecordRun):
         self._seen.record = self._copy.ctypes.data
         self._seen.late, self._seen.beyond = disc.late, disc.late + disc.shared
         self._rows = np.arange(disc.shared, dtype=np.int32)
-        self._acted = self._acted_on()
+        self._touched = self._touched_nodes()
         self._sampled: tuple[int, float] | None = None
 
-    def _acted_on(self) -> npt.NDArray[np.int32]:
+    def _touched_nodes(self) -> npt.NDArray[np.int32]:
         """Nodes that loads or moving supports act on, on any rank."""
         problem, disc = self.problem, self.problem.disc
         flags = np.zeros((disc.nodes + 1, 1))
-        flags[problem.load_position // disc.record] = 1.0
+        flags[self.acted] = 1.0
         flags[problem.moving[0]] = 1.0
-        if problem.kernels.constant is not None:
-            flags[np.any(problem.kernels.constant[:, : disc.n] != 0, axis=1)] = 1.0
         disc.sum_shared(flags[:-1])
         return np.flatnonzero(flags[:-1, 0]).astype(np.int32)
 
     def _touch(self, t: float) -> None:
         self.c.cb_exact_touch(
-            self._world, native.pointer(self._acted), ctypes.c_int64(len(self._acted)),
+            self._world, native.pointer(self._touched), ctypes.c_int64(len(self._touched)),
             ctypes.c_double(t),
         )  # fmt: skip
 
@@ -80,7 +78,7 @@ class ExactRun(RecordRun):
             self._touch(start)
             self._move_supports(start)
             self._load_kick(start, 0.5 if trapezoidal else 1.0)
-            self.updates += self.schedule.run(self.c, self._world, start, end)
+            self._count(self.schedule.run(self.c, self._world, start, end))
             self._touch(end)
             if trapezoidal:
                 self._load_kick(end)
@@ -95,8 +93,7 @@ class ExactRun(RecordRun):
         t, before = ctypes.c_double(self.time), float(self.sums[0])
         disc, seen = self.problem.disc, ctypes.byref(self._seen)
         np.copyto(self._copy, self.record)
-        nodes = ctypes.c_int64(disc.nodes)
-        self.c.cb_drift(seen, ctypes.c_int64(0), nodes, t)
+        self.c.cb_drift(seen, t)
         self.c.cb_exact_complete(seen, self._ahead, ctypes.c_int64(disc.blocks), t)
         if self.problem.comm.size > 1:
             message = self._message(self._rows)
@@ -110,7 +107,7 @@ class ExactRun(RecordRun):
         self._see()
         kernels, n = self.problem.kernels, self.problem.disc.n
         kernels.x[:, :n] = self._copy[:, :n]
-        self.c.cb_get_rates(ctypes.byref(self._seen), native.pointer(self._rates))
+        self.c.cb_get_rates(ctypes.byref(self._seen), native.pointer(self._rates), *self._all)
         if self._inert:
             self._follow(self._rates)
         return kernels.x, self._rates

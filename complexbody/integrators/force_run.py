@@ -9,18 +9,18 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody import native
+from complexbody.integrators.activity import Counted
 from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
 
 
-class ForceRun:
+class ForceRun(Counted):
     """A run with one step for all cells.
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
-        updates: Cell updates done by this rank.
         ready: Whether f holds the forces at (x_n, t_n).
         time_sets: None: all act together.
     """
@@ -29,9 +29,10 @@ class ForceRun:
 
     def __init__(self, problem: Problem, step: float, critical: float) -> None:
         self.problem, self.step, self.critical = problem, step, critical
-        self.steps, self.updates, self.ready = 0, 0, False
+        self.steps, self.ready = 0, False
         # Whose masses a node has: sums of energies read it too.
         problem.kernels.state.klass = problem.masses.classes.ctypes.data
+        self.state = ctypes.byref(problem.kernels.state)
 
     @property
     def time(self) -> float:
@@ -46,8 +47,8 @@ class ForceRun:
             return
         problem = self.problem
         problem.load_forces(self.amplitude(self.time))
-        self.problem.kernels.c.cb_forces(ctypes.byref(self.problem.kernels.state))
-        self.updates += problem.disc.count
+        self.problem.kernels.c.cb_forces(self.state)
+        self._count(problem.disc.count)
         if problem.comm.size > 1:
             self._exchange_begin()
             self._exchange_end()

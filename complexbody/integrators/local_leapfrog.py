@@ -188,8 +188,10 @@ class LocalLeapfrogRun(SynchronousRun):
         self._driven = problem.comm.allreduce(len(problem.moving[0])) > 0
         self._loaded = problem.comm.allreduce(len(problem.load_value)) > 0
         self._messages: list[octaves.Message] = []
-        if self.levels:
+        if self.levels:  # octaves act on all their cells
             self._make(method, plan.level[disc.dof])
+        else:
+            self.watch()
 
     def _make(self, method: LocalLeapfrog, level: octaves.Ints) -> None:
         problem, kernels, L = self.problem, self.problem.kernels, self.levels

@@ -77,6 +77,11 @@ class PeerRun:
         return self.steps * self.step
 
     @property
+    def skipped(self) -> int:
+        """None: all cells are looked at in every step."""
+        return 0
+
+    @property
     def updates(self) -> int:
         """Cells that forces, matrices or products passed over, on this rank."""
         return (self.system.evaluations + self.linear) * self.problem.disc.count

@@ -16,8 +16,10 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import native
-from complexbody.integrators.entries import Entries, energies
+from complexbody.integrators.activity import Counted
+from complexbody.integrators.entries import Entries
 from complexbody.integrators.messages import Message
+from complexbody.integrators.record_books import entries
 from complexbody.integrators.timetable import TimeSets
 from complexbody.kernels import events
 from complexbody.problem import Problem
@@ -42,14 +44,14 @@ class World(ctypes.Structure):
                 "basis",
                 "collected",
                 "groups", "cell", "geometry", "coefficient", "held", "blend", "sums",
-                "counted", "coordinates", "forms", "touched", "touched_from",
+                "counted", "coordinates", "forms", "touched", "touched_from", "activity",
             )
         ),
         ("start", ctypes.c_double),
     )  # fmt: skip
 
 
-class RecordRun:
+class RecordRun(Counted):
     """Node records of an asynchronous run and what does not depend on its schedule; collective.
 
     Args:
@@ -61,12 +63,14 @@ class RecordRun:
     Attributes:
         time: t at the last beat's end [s]; steps: beats done; step: their length [s].
         critical: Critical step of the smallest cell [s], that of a synchronous run.
-        updates: Cell updates (forces) done by this rank.
         record: Node records (nodes + 1, doubles per node); the last one is padding.
+        acted: Nodes that loads or constant forces of the bodies act on, on any rank.
+        skips_energies: Whether quiet cells have no energy either.
         time_sets: Who acts when: what the paper calls Θ, with speed-ups.
     """
 
     time_sets: TimeSets
+    skips_energies: bool = False
 
     record: Array
     inverse_mass: Array
@@ -81,7 +85,7 @@ class RecordRun:
         self.problem, self.method, self.step = problem, method, step
         smallest = float(np.min(critical, initial=np.inf))
         self.critical = float(problem.comm.allreduce(smallest, op=MPI.MIN))
-        self.steps, self.updates = 0, 0
+        self.steps = 0
         disc, kernels, masses = problem.disc, problem.kernels, problem.masses
         # Components that differ in their rate are drifted one by one, like those without inertia.
         slow = not masses.diagonal or (masses.damped and not masses.one_rate)
@@ -99,7 +103,10 @@ class RecordRun:
         self.sums = kernels.sums
         self.sums[:] = 0.0
         self.work, self.support_work = 0.0, 0.0
-        self._loaded = problem.comm.allreduce(len(problem.load_value)) > 0
+        self.acted = self._acted()
+        self._loaded = problem.comm.allreduce(len(self.acted)) > 0
+        self._all = native.pointer(None), ctypes.c_int64(disc.nodes)
+        self._some = native.pointer(self.acted), ctypes.c_int64(len(self.acted))
         self.mass = np.ascontiguousarray(masses.full(masses.inertia, masses.density))
         kernels.state.klass = masses.classes.ctypes.data
         self._supported = problem.comm.allreduce(len(problem.moving[0])) > 0
@@ -213,9 +220,20 @@ class RecordRun:
         problem.disc.sum_shared(force)
         return force
 
-    def _add_loads(self, t: float) -> None:
-        """Loads at t, and the constant part of the bodies' own forces, into the force buffer."""
+    def _acted(self) -> npt.NDArray[np.int32]:
+        """Nodes that loads or the bodies' own constant forces act on, on any rank."""
+        problem, disc = self.problem, self.problem.disc
+        flags = np.zeros((disc.nodes + 1, 1))
+        flags[problem.load_position // disc.record] = 1.0
+        if problem.kernels.constant is not None:
+            flags[np.any(problem.kernels.constant[:, : disc.n] != 0, axis=1)] = 1.0
+        disc.sum_shared(flags[:-1])
+        return np.flatnonzero(flags[:-1, 0]).astype(np.int32)
+
+    def _load_forces(self, t: float) -> None:
+        """Loads at t, and the bodies' own constant forces, into the force buffer; collective."""
         problem = self.problem
+        self._force[self.acted] = 0.0
         if len(problem.load_value):
             amplitude = problem.loads.amplitudes(np.array([t]))[0]
             np.add.at(
@@ -224,21 +242,21 @@ class RecordRun:
             )  # fmt: skip
         if problem.kernels.constant is not None:
             self._force += problem.kernels.constant
+        self._sum_shared(self._force)
 
     def _load_kick(self, t: float, part: float = 0.5) -> None:
         """A kick by loads at t, over ``part`` of a beat."""
-        if not self._loaded and self.problem.kernels.constant is None:
+        if not self._loaded:
             return
-        self._force[:] = 0.0
-        self._add_loads(t)
-        self._sum_shared(self._force)
+        self._load_forces(t)
         before, weight = self._load_power(t), part * self.step
-        self.c.cb_push(self._world, ctypes.c_double(weight), native.pointer(self._force))
+        force = native.pointer(self._force)
+        self.c.cb_push(self._world, ctypes.c_double(weight), force, *self._some)
         self.work += 0.5 * weight * (before + self._load_power(t))
 
     def _load_power(self, t: float) -> float:
         """Power of the loads on the records' rates at t, this rank's share."""
-        self.c.cb_get_rates(self._world, native.pointer(self._rates))
+        self.c.cb_get_rates(self._world, native.pointer(self._rates), *self._some)
         return self.problem.load_power(self.problem.loads.amplitudes(np.array([t]))[0], self._rates)
 
     # --- shared nodes --------------------------------------------------------------------------
@@ -263,7 +281,7 @@ class RecordRun:
         """(u, ν) and rates at the last beat's end, node records (nodes + 1, NR)."""
         kernels, n = self.problem.kernels, self.problem.disc.n
         kernels.x[:, :n] = self.record[:, :n]
-        self.c.cb_get_rates(self._world, native.pointer(self._rates))
+        self.c.cb_get_rates(self._world, native.pointer(self._rates), *self._all)
         if self._inert:
             self._follow(self._rates)
         return kernels.x, self._rates
@@ -287,16 +305,4 @@ class RecordRun:
 
     def entries(self) -> Entries:
         """Energies and works at the last beat's end; collective."""
-        _, rates = self.sample()
-        common = energies(self.problem, self.mass, rates)
-        works: dict[str, Any] = {
-            "work": self.work, "support_work": self.support_work,
-            "dissipated": self.dissipated(),
-        }  # fmt: skip
-        kinetic = common["kinetic_u"] + common["kinetic_nu"]
-        given = self.work + self.support_work - works["dissipated"]
-        return Entries(
-            **common, **works,
-            surplus=kinetic + common["stored"] + common["potential"] - given,
-            discrete=0.0, flows=0.0, size=0.0, variation_u=np.nan, variation_nu=np.nan,
-        )  # fmt: skip
+        return entries(self)

@@ -94,4 +94,6 @@ class Synchronous:
                 "run would be unstable. Give a smaller step, or unstable_ok=True to see it happen."
             )
         problem.stiffen(float(step))
-        return SynchronousRun(problem, self, float(step), float(critical))
+        run = SynchronousRun(problem, self, float(step), float(critical))
+        run.watch()
+        return run

@@ -24,9 +24,9 @@ def entries(run: SynchronousRun) -> Entries:
     problem, kernels, n = run.problem, run.problem.kernels, run.problem.disc.n
     x, rates = run.sample()
     work, support, lost = _works(run, rates)
-    drift = half_quadratic(problem, run.mean, kernels.v, 0, n)
+    drift = half_quadratic(problem, run.mean, kernels.v, 0, n, run.watched)
     discrete, size = _discrete(run, x, drift)
-    common = energies(problem, run.mass, rates)
+    common = energies(problem, run.mass, rates, run.watched)
     flows = float(kernels.sums[3] + kernels.sums[4] - kernels.sums[0])
     return Entries(
         **common, work=work, support_work=support, dissipated=lost,
@@ -45,7 +45,7 @@ def _works(run: SynchronousRun, rates: Array) -> tuple[float, float, float]:
     np.add(kernels.v, rates, out=run.scratch)
     work = kernels.sums[3] + h / 4 * problem.load_power(run.amplitude(run.time), run.scratch)
     lost = kernels.sums[0] + h / 4 * half_quadratic(
-        problem, run.eta, run.scratch, 0, problem.disc.n
+        problem, run.eta, run.scratch, 0, problem.disc.n, run.watched
     )
     return float(work), float(kernels.sums[4]) + run.support_work, float(lost)
 

@@ -16,9 +16,11 @@ from mpi4py import MPI
 
 from complexbody import native
 from complexbody.errors import IntegratorError
+from complexbody.integrators.activity import ENOUGH, Activity, active
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.synchronous_books import entries
+from complexbody.kernels.library import State
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -48,7 +50,8 @@ class SynchronousRun(ForceRun):
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
-        updates: Cell updates done by this rank.
+        watched: What the C functions read, with the activity in it; None if energies of quiet cells
+            are not zero.
         support_work: Work of this rank's moving supports in the half step before a sample [J].
     """
 
@@ -59,7 +62,8 @@ class SynchronousRun(ForceRun):
         if not masses.diagonal:  # the same on all ranks, unlike what moves there
             refuse_partial(problem)
         kernels.select(masses.diagonal, masses.damped)
-        self.c, self.state = kernels.c, ctypes.byref(kernels.state)
+        self.c = kernels.c
+        self.watched: State | None = None
         rec = masses.recursion(step, method.dissipation)
         if method.start == "one-sided":
             # Kicks sit at the left ends of intervals: momenta at t_n are those before the kick.
@@ -86,6 +90,26 @@ class SynchronousRun(ForceRun):
         kernels.x[:-1, : disc.n] = problem.initial_fields
         self.support_work = 0.0
         kernels.reset_forces()
+        # A copy, since whoever else asks the kernels asks for all cells.
+        self._own = State.from_buffer_copy(s)
+        self.state = ctypes.byref(self._own)
+
+    def watch(self) -> None:
+        """Skip what is quiet from now on, if enough is; before the first step."""
+        problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
+        if not (problem.quiet and disc.blocks):
+            return
+        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
+        stirred = (stirred | (kernels.f[:-1, : disc.n] != 0)).any(axis=1)
+        stirred[problem.load_position // disc.record] = True
+        if active(disc.cells, stirred) > ENOUGH:
+            return
+        awake, energetic = kernels.restless()
+        ends, late = np.append(disc.chunks[:, 3], disc.nodes), np.array([len(disc.chunks)])
+        self.activity = Activity(self.c, disc.chunks[:, 1], disc.cells, ends, stirred, awake, late)
+        self._own.activity = ctypes.addressof(self.activity.state)
+        self.watched = None if energetic else self._own
+        self.c.cb_look(self.state)
 
     # --- steps -------------------------------------------------------------------------------
 
@@ -100,7 +124,6 @@ class SynchronousRun(ForceRun):
         if steps <= 0:
             return
         problem, disc = self.problem, self.problem.disc
-        self.updates += steps * disc.count
         alone = problem.comm.size == 1 and not len(problem.moving[0])
         if alone:
             times = (self.steps + np.arange(steps)) * self.step
@@ -112,9 +135,10 @@ class SynchronousRun(ForceRun):
                 ctypes.c_int64(amplitudes.shape[1]),
             )  # fmt: skip
             self.steps += steps
-            return
-        for _ in range(steps):
-            self._overlapped()
+        else:
+            for _ in range(steps):
+                self._overlapped()
+        self._count(steps * disc.count)
 
     def _overlapped(self) -> None:
         """One step with messages flying while interior cells are worked on."""
@@ -137,17 +161,17 @@ class SynchronousRun(ForceRun):
         problem, kernels = self.problem, self.problem.kernels
         amplitude = self.amplitude(self.time)
         kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
-        self.c.cb_update(self.state, ctypes.c_int64(0), ctypes.c_int64(problem.disc.late))
+        self.c.cb_update(self.state)
         self._late()
         kernels.sums[3] += 0.5 * self.step * problem.load_power(amplitude, kernels.v)
         self.steps += 1
         self.ready = False
 
     def _late(self) -> None:
-        disc = self.problem.disc
         if len(self.problem.moving[0]):
             self._move()
-        self.c.cb_update(self.state, ctypes.c_int64(disc.late), ctypes.c_int64(disc.nodes))
+        self.c.cb_update_late(self.state)
+        self.c.cb_look(self.state)
 
     def _move(self) -> None:
         rows, columns = self.problem.moving
@@ -164,37 +188,43 @@ class SynchronousRun(ForceRun):
         )  # fmt: skip
         self.forces()
         n, weight = disc.n, 0.5 if self.method.start == "trapezoidal" else 1.0
-        v0 = problem.rates_at_start(1e-3 * self.step)
-        klass = problem.masses.classes[:-1]
-        f = kernels.f[:-1, :n] * kernels.inverse_volume[:, None]
+        rates = problem.rates_at_start(1e-3 * self.step)
+        moves = ((rates != 0) | (kernels.f[:-1, :n] != 0)).any(axis=1)
+        moves[problem.moving[0]] = True
+        at = np.flatnonzero(moves)  # all others stay at rest
+        v0, klass = rates[at], problem.masses.classes[at]
+        volume, owned = disc.volume[at], disc.owned[at]
+        f = kernels.f[at, :n] * kernels.inverse_volume[at, None]
         v1 = np.einsum("aij,aj->ai", rec.from_rate[klass], v0)
         v1 += weight * np.einsum("aij,aj->ai", rec.beta[klass], f)
         rows, columns = problem.moving
+        moving = np.searchsorted(at, rows), columns
         if len(rows):
-            v1[rows, columns] = (problem.targets(self.step) - kernels.x[rows, columns]) / self.step
-        both, owned = v0 + v1, disc.owned
+            v1[moving] = (problem.targets(self.step) - kernels.x[rows, columns]) / self.step
+        both = v0 + v1
         # Half a step: (M̂ + hD/2)v⁺ − Mq̇₀ = (h/2)f times the mean of its ends' rates balances
         # ½v⁺·M̂v⁺ − ½q̇₀·Mq̇₀ (also where hη ≫ ρ̄) with the works of loads and supports.
         lost = np.einsum("ai,aij,aj->a", v0, (self.mean - self.mass)[klass], v1)
         lost += 0.5 * self.step * np.einsum("ai,aij,aj->a", both, self.eta[klass], v1)
-        kernels.sums[0] += 0.5 * np.sum(lost * disc.volume * owned)
-        amplitude = self.amplitude(0.0)
-        full = np.zeros_like(kernels.v)
-        full[:-1, :n] = both
-        kernels.sums[3] += self.step / 4 * problem.load_power(amplitude, full)
+        kernels.sums[0] += 0.5 * np.sum(lost * volume * owned)
+        self.scratch[:] = 0.0
+        self.scratch[at, :n] = both
+        power = problem.load_power(self.amplitude(0.0), self.scratch)
+        kernels.sums[3] += self.step / 4 * power
         if len(rows):
             momentum = np.einsum("aij,aj->ai", (self.mean + 0.5 * self.step * self.eta)[klass], v1)
             momentum -= np.einsum("aij,aj->ai", self.mass[klass], v0)
-            impulse = disc.volume[:, None] * (momentum - weight * self.step * f)
-            kernels.sums[4] += (0.5 * impulse * both * owned[:, None])[rows, columns].sum()
-        jump = np.abs(v1 - v0) * (disc.volume * owned)[:, None]
+            impulse = volume[:, None] * (momentum - weight * self.step * f)
+            kernels.sums[4] += (0.5 * impulse * both * owned[:, None])[moving].sum()
+        jump = np.abs(v1 - v0) * (volume * owned)[:, None]
         n_u = problem.scene.displacement
         kernels.sums[1] += jump[:, :n_u].sum()
         kernels.sums[2] += jump[:, n_u:].sum()
-        kernels.v[:-1, :n] = v1
-        kernels.x[:-1, :n] += self.step * v1
+        kernels.v[at, :n] = v1
+        kernels.x[at, :n] += self.step * v1
         kernels.reset_forces()
         self.steps, self.ready = 1, False
+        self.c.cb_look(self.state)
 
     # --- what a user sees at t_n -------------------------------------------------------------
 
@@ -208,7 +238,7 @@ class SynchronousRun(ForceRun):
         else:
             self.c.cb_rates(
                 self.state, native.pointer(self._to_rate), native.pointer(self._force_to_rate),
-                ctypes.c_int64(0), ctypes.c_int64(disc.nodes), native.pointer(self.rates),
+                native.pointer(self.rates),
             )  # fmt: skip
             if len(self.problem.moving[0]):
                 self._sample_moving()

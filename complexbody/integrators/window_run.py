@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from complexbody.integrators.activity import ENOUGH, Activity, active
 from complexbody.integrators.balance import Balance
 from complexbody.integrators.records import RecordRun
 from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.integrators.windows import WindowPlan
+from complexbody.kernels.events import RANGE
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -43,6 +45,27 @@ class WindowRun(RecordRun):
         self.balance = Balance(self, self.plan) if method.balanced else None
         if self.balance is not None:
             self._point(held=self.balance.held, blend=self.balance.blend)
+        self._watch()
+
+    def _watch(self) -> None:
+        """Skip what is quiet from now on, if enough is; before the first window."""
+        problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
+        if not (problem.quiet and disc.blocks):
+            return
+        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
+        stirred = stirred.any(axis=1)
+        stirred[self.acted] = True
+        if active(disc.cells, stirred) > ENOUGH:
+            return
+        force, energetic = kernels.restless()
+        restless = np.repeat(force, np.diff(disc.chunks[:, :2], axis=1).ravel())
+        ends = self.plan.chunk_ends
+        awake = np.add.reduceat(restless, np.append(0, ends[:-1])) > 0
+        ranges = np.append(np.arange(RANGE, disc.nodes, RANGE), disc.nodes)
+        late = np.arange(disc.late // RANGE, len(ranges))
+        self.activity = Activity(self.c, ends, disc.cells, ranges, stirred, awake, late)
+        self.world.activity = ctypes.addressof(self.activity.state)
+        self.skips_energies = not energetic
 
     def advance(self, windows: int) -> None:
         """Do ``windows`` windows; collective."""
@@ -68,8 +91,8 @@ class WindowRun(RecordRun):
         if not whole:
             self._together(end, 0)
             self._load_kick(end)
-            self.updates += self.problem.disc.count
-        self.updates += self.plan.updates
+            self._count(self.problem.disc.count)
+        self._count(self.plan.updates)
 
     def _balanced(self, balance: Balance) -> None:
         """Forces act all the time; all cells renew theirs at the window's end."""
@@ -85,7 +108,7 @@ class WindowRun(RecordRun):
         amplitude = self.problem.loads.amplitudes(np.array([start + 0.5 * self.step]))[0]
         moved = (self._loaded_positions() - loaded) * self.problem.load_value
         self.work += float(np.dot(amplitude[self.problem.load_group], moved))
-        self.updates += self.plan.updates
+        self._count(self.plan.updates)
 
     def _replay(self, start: float, end: float) -> None:
         """The window's events between its ends, and all nodes to its end."""
@@ -105,8 +128,7 @@ class WindowRun(RecordRun):
                 replay(cut.shared, cut.last)
                 message.end(start + cut.time)
             replay(plan.cuts[-1].last if plan.cuts else 0, plan.total)
-        nodes = ctypes.c_int64(self.problem.disc.nodes)
-        c.cb_drift(self._world, ctypes.c_int64(0), nodes, ctypes.c_double(end))
+        c.cb_drift(self._world, ctypes.c_double(end))
 
     def _loaded_positions(self) -> Array:
         """Values of the components that loads act on, entry by entry."""

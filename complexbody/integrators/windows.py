@@ -126,6 +126,7 @@ class WindowPlan:
         edge: Number of groups touching shared nodes.
         events: C array of interior events, 0 < t < W, by time; shared-node groups first.
         touched, touched_from: Nodes that drift before each chunk of blocks acts.
+        chunk_ends: Where these chunks end, in blocks.
         cuts: Exchanges (several ranks only), at the same times on every rank.
         every_shared: All shared nodes by position.
         updates: Cell updates per window (boundary counted once) on this rank.
@@ -155,6 +156,7 @@ class WindowPlan:
         group = np.searchsorted(runs[:, 1], blocks, side="right")
         first = np.array([self.groups[i].chunk for i in range(self.count)], np.int64)
         chunk = first[group] + (blocks - runs[group, 0]) // CHUNK
+        self.chunk_ends = np.flatnonzero(np.diff(chunk, append=chunks)) + 1
         nodes = disc.cells.reshape(disc.blocks, -1)
         key, at = np.unique(group[:, None] * (disc.nodes + 1) + nodes, return_index=True)
         node, chunk = key % (disc.nodes + 1), chunk[at // max(nodes.shape[1], 1)]

@@ -1,6 +1,6 @@
 /* SPDX-License-Identifier: LGPL-3.0-or-later
  * Asynchronous events: what nodes and cells carry, and how a node drifts from kick to kick. Behind
- * vectors.h and tabulated.h. A node's record holds everything a drift needs:
+ * vectors.h, tabulated.h and quiet.h. A node's record holds everything a drift needs:
  *   [ position (NR) | rate (NR) | acceleration (NR, only if BALANCED) | time, 1/volume ]
  * time and 1/volume sit in the padding of position where there is room (TIME, INVERSE).
  * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK. Unless SLOW,
@@ -47,6 +47,7 @@ typedef struct {
   const tabulated *forms;
   const int32_t *touched;     /* the nodes of each chunk of CHUNK blocks no chunk of its group had */
   const int64_t *touched_from; /* [chunk + 1] */
+  activity *activity;         /* of chunks of CHUNK blocks and ranges of RANGE nodes, or NULL */
   double start;               /* of the window */
 } world;
 

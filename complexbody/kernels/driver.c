@@ -1,8 +1,8 @@
 /* SPDX-License-Identifier: LGPL-3.0-or-later
  * Loops over blocks of cells and over nodes: forces, energies, and the synchronous step.
  *
- * Assembled behind vectors.h and the regions' functions; needs N, NU, NR, DIM, GEOMETRY,
- * COEFFICIENTS, DIAGONAL, DAMPED, FORCE(region, ...), ENERGY(region, ...).
+ * Assembled behind vectors.h, quiet.h and the regions' functions; needs N, NU, NR, DIM, GEOMETRY,
+ * COEFFICIENTS, DIAGONAL, DAMPED, FORCE(region, ...), ENERGY(region, ...), RESTLESS(region, ...).
  *
  * One step (kick, drift) with effective mass Mh and damping D, from the discrete principle:
  *   (Mh + hD/2) v+ = (Mh - hD/2) v- + h f,   x += h v+
@@ -28,6 +28,7 @@ typedef struct {
   const double *coordinates;      /* [node][3], for tabulated kernels */
   const uint8_t *counted;         /* 1 where this rank counts the node in sums, [node] */
   const tabulated *forms;         /* [region]{force, stored, potential energy}, where FFCx made them */
+  activity *activity;             /* of chunks, and of the nodes each finishes; or NULL */
 } state;
 
 #define VN (NR < 8 ? NR : 8) /* components of one node vector */
@@ -37,7 +38,13 @@ typedef long long nivec __attribute__((vector_size(8 * VN)));
 
 INLINE nvec nabs(nvec a) { return (nvec)((nivec)a & 0x7fffffffffffffffLL); }
 
-static void force_chunk(const state *s, const chunk *t) {
+/* Whatever may be skipped is not inlined: the same instructions do it whether or not others are. */
+#define APART __attribute__((noinline))
+
+/* NULL if all act. */
+INLINE activity *quiet(const state *s) { return s->activity && s->activity->on ? s->activity : NULL; }
+
+static APART void force_chunk(const state *s, const chunk *t) {
   if (t->last > t->first)
     FORCE(t->region, t->last - t->first, t->first, s->cell + t->first * (DIM + 1) * W,
           s->geometry + t->first * GEOMETRY * W, s->coefficient + t->first * COEFFICIENTS * W, s);
@@ -45,7 +52,7 @@ static void force_chunk(const state *s, const chunk *t) {
 
 /* Kick and drift the nodes [first, last) and make f ready for the next step. Sums: dissipated
  * work h/4 (v+ + v-) D (v+ + v-), and the variation of the rates, the integral of |v+ - v-|_1. */
-static void update(const state *s, int64_t first, int64_t last) {
+static APART void update(const state *s, int64_t first, int64_t last) {
   const double h = s->step;
   nvec variation[NR / VN] = {{0}}, lost[NR / VN] = {{0}};
   for (int64_t a = first; a < last; a++) {
@@ -94,49 +101,60 @@ static void update(const state *s, int64_t first, int64_t last) {
   }
 }
 
-/* Whole step on this rank alone: each chunk of cells, then the nodes no later cell touches. */
-static void fused(const state *s, int64_t first_chunk) {
-  int64_t node = first_chunk ? s->table[first_chunk - 1].nodes : 0;
-  for (int64_t c = first_chunk; c < s->chunks; c++) {
-    force_chunk(s, s->table + c);
-    update(s, node, s->table[c].nodes);
-    node = s->table[c].nodes;
+/* The nodes that chunk c finishes: [first_node(c), s->table[c].nodes). */
+INLINE int64_t first_node(const state *s, int64_t c) { return c ? s->table[c - 1].nodes : 0; }
+
+/* Forces of chunks [first, last) and, if `move`, kick and drift of the nodes no later cell touches. */
+static void act(const state *s, int64_t first, int64_t last, int move) {
+  activity *q = quiet(s);
+  for (int64_t c = first; c < last; c++) {
+    if (!q || q->awake[c]) force_chunk(s, s->table + c); else q->skipped += q->size[c];
+    if (move && (!q || q->stirred[c])) update(s, first_node(s, c), s->table[c].nodes);
   }
 }
 
 /* Chunks whose cells touch nodes shared with other ranks, with the nodes complete after them. */
-void cb_boundary_forces(const state *s) {
-  int64_t node = 0;
-  for (int64_t c = 0; c < s->boundary_chunks; c++) {
-    force_chunk(s, s->table + c);
-    update(s, node, s->table[c].nodes);
-    node = s->table[c].nodes;
+void cb_boundary_forces(const state *s) { act(s, 0, s->boundary_chunks, 1); }
+
+void cb_interior_step(const state *s) { act(s, s->boundary_chunks, s->chunks, 1); }
+
+/* Kick and drift by forces that are there: nodes that cells finish, or those behind them. */
+void cb_update(const state *s) {
+  activity *q = quiet(s);
+  for (int64_t c = 0; c < s->chunks; c++)
+    if (!q || q->stirred[c]) update(s, first_node(s, c), s->table[c].nodes);
+}
+
+void cb_update_late(const state *s) { update(s, s->interior, s->nodes); }
+
+/* All forces on top of what f holds, nodes untouched. */
+void cb_forces(const state *s) { act(s, 0, s->chunks, 0); }
+
+/* After a step: chunks that the motion has reached. Forces depend on positions alone. */
+void cb_look(const state *s) {
+  activity *q = quiet(s);
+  for (int64_t c = 0; q && c < q->chunks; c++) {
+    if (q->awake[c] || !q->near[c]) continue;
+    for (int64_t i = q->node_from[c]; i < q->node_from[c + 1]; i++)
+      if (!at_zero(s->x + (int64_t)q->node[i] * NR, NR)) {
+        wake(q, c);
+        break;
+      }
   }
 }
 
-void cb_interior_step(const state *s) { fused(s, s->boundary_chunks); }
-
-void cb_update(const state *s, int64_t first, int64_t last) { update(s, first, last); }
-
-/* All forces on top of what f holds, nodes untouched. */
-void cb_forces(const state *s) {
-  for (int64_t c = 0; c < s->chunks; c++) force_chunk(s, s->table + c);
+/* Where cells have forces (by chunk) or energies even at x = 0, which s->x must be. */
+void cb_restless(const state *s, uint8_t *force, uint8_t *energy) {
+  for (int64_t c = 0; c < s->chunks; c++) {
+    const chunk *t = s->table + c;
+    RESTLESS(t->region, t->last - t->first, t->first, s->cell + t->first * (DIM + 1) * W, s,
+             force + c, energy)
+  }
 }
 
 /* Forces of some chunks of cells only, on top of what f holds. */
 void cb_forces_of(const state *s, const chunk *table, int64_t count) {
   for (int64_t c = 0; c < count; c++) force_chunk(s, table + c);
-}
-
-/* out[2 r] += stored, out[2 r + 1] += potential energy of region r. */
-void cb_energies(const state *s, double *out) {
-  for (int64_t c = 0; c < s->chunks; c++) {
-    const chunk *t = s->table + c;
-    if (t->last > t->first)
-      ENERGY(t->region, t->last - t->first, t->first, s->cell + t->first * (DIM + 1) * W,
-             s->geometry + t->first * GEOMETRY * W, s->coefficient + t->first * COEFFICIENTS * W, s,
-             out + 2 * t->region);
-  }
 }
 
 /* Loads: f += amplitude[group] * value at flat positions; returns their power on the rates v. */
@@ -159,7 +177,8 @@ void cb_steps(const state *s, int64_t steps, int64_t count, const int64_t *posit
     const double *a = amplitude + i * groups;
     cb_add_loads(count, position, group, value, a, s->f);
     s->sums[3] += 0.5 * s->step * cb_power(count, position, group, value, a, s->v);
-    fused(s, 0);
+    act(s, 0, s->chunks, 1);
+    cb_look(s);
     s->sums[3] += 0.5 * s->step * cb_power(count, position, group, value, a, s->v);
   }
 }
@@ -180,54 +199,6 @@ void cb_sum_shared(int64_t count, int64_t first, const int64_t *start, const int
     }
     memcpy(own, sum, sizeof sum);
   }
-}
-
-/* rates = a v + b f / volume at nodes [first, last): rates at the step's own time. */
-void cb_rates(const state *s, const double *a, const double *b, int64_t first, int64_t last,
-              double *rates) {
-  for (int64_t m = first; m < last; m++) {
-    const int64_t k = s->klass ? s->klass[m] : 0;
-    const double *v = s->v + m * NR, *f = s->f + m * NR;
-    for (int i = 0; i < N; i++) {
-#if DIAGONAL
-      rates[m * NR + i] = a[k * NR + i] * v[i] + b[k * NR + i] * s->inverse_volume[m] * f[i];
-#else
-      double sum = 0;
-      for (int j = 0; j < N; j++)
-        sum += a[k * N * N + i * N + j] * v[j] + b[k * N * N + i * N + j] * s->inverse_volume[m] * f[j];
-      rates[m * NR + i] = sum;
-#endif
-    }
-  }
-}
-
-/* Half the sum over counted nodes of volume * w.m w on components [c0, c1), m per class (n x n). */
-double cb_quadratic(const state *s, const double *matrix, const double *w, int64_t c0, int64_t c1) {
-  double total = 0;
-  for (int64_t a = 0; a < s->nodes; a++) {
-    if (!s->counted[a]) continue;
-    const double *m = matrix + (s->klass ? s->klass[a] : 0) * N * N, *r = w + a * NR;
-    double sum = 0;
-#if DIAGONAL
-    for (int64_t i = c0; i < c1; i++) sum += m[i * N + i] * r[i] * r[i];
-#else
-    for (int64_t i = c0; i < c1; i++)
-      for (int64_t j = c0; j < c1; j++) sum += m[i * N + j] * r[i] * r[j];
-#endif
-    total += 0.5 * s->volume[a] * sum;
-  }
-  return total;
-}
-
-/* Sum over counted nodes of f.(x - h v): forces on the positions one step before. */
-double cb_force_before(const state *s) {
-  double total = 0;
-  for (int64_t a = 0; a < s->nodes; a++) {
-    if (!s->counted[a]) continue;
-    const double *x = s->x + a * NR, *v = s->v + a * NR, *f = s->f + a * NR;
-    for (int i = 0; i < N; i++) total += f[i] * (x[i] - s->step * v[i]);
-  }
-  return total;
 }
 
 /* Prescribed motion: rates of prescribed components that bring x to its target at the step's end.

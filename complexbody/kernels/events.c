@@ -1,14 +1,42 @@
 /* SPDX-License-Identifier: LGPL-3.0-or-later
  * Replay of windows: events in order, boundaries of windows. Behind events.h and the
- * regions' event functions; needs EVENT(region, ...), without which there is no replay. */
+ * regions' event functions; needs EVENT(region, ...), without which there is no replay, and RANGE. */
+
+INLINE activity *quiet(const world *s) { return s->activity && s->activity->on ? s->activity : NULL; }
 
 #ifdef EVENT
-/* Chunk by chunk, nodes drift and cells kick: what drifts together is still in cache when kicked. */
+/* True if all nodes of chunk c are at zero: position, rate, acceleration. */
+static int at_rest(const world *s, const activity *q, int64_t c) {
+  for (int64_t i = q->node_from[c]; i < q->node_from[c + 1]; i++) {
+    const double *r = record_of(s, q->node[i]);
+    if (!at_zero(r, N) || !at_zero(r + NR, (PARTS - 1) * NR)) return 0;
+  }
+  return 1;
+}
+
+/* Chunk by chunk, nodes drift and cells kick: what drifts together is still in cache when kicked.
+ * The time of a quiet node may lag behind: nothing is lost, since it moves as soon as it is told to. */
 static void act(const world *s, const group *g, double t, double weight, int mode) {
   const int64_t *from = s->touched_from + g->chunk;
-  for (int64_t m = g->first; m < g->last; m += CHUNK, from++) {
+  activity *q = quiet(s);
+  int64_t c = g->chunk;
+  for (int64_t m = g->first; m < g->last; m += CHUNK, from++, c++) {
     const int64_t blocks = m + CHUNK < g->last ? CHUNK : g->last - m;
-    drift_all(s, s->touched + from[0], from[1] - from[0], t);
+    const int quiet_so_far = q && !q->awake[c];
+    if (quiet_so_far && !q->near[c]) {
+      q->skipped += q->size[c];
+      continue;
+    }
+    const int stays = quiet_so_far && at_rest(s, q, c);
+    drift_all(s, s->touched + from[0], from[1] - from[0], t); /* awake neighbours count on it */
+    if (stays) {
+      q->skipped += q->size[c];
+      continue;
+    }
+    if (quiet_so_far) { /* chunks before this one, which were quiet, have let its nodes lie */
+      wake(q, c);
+      drift_all(s, q->node + q->node_from[c], q->node_from[c + 1] - q->node_from[c], t);
+    }
     EVENT(g->region, blocks, m, s->cell + m * (DIM + 1) * W, s->geometry + m * GEOMETRY * W,
           s->coefficient + m * COEFFICIENTS * W, s->held + m * HELD * W,
           s->blend + (g - s->groups) * NR, s, weight, mode);
@@ -29,9 +57,13 @@ void cb_together(const world *s, int64_t first, int64_t last, double t, double p
 }
 #endif
 
-void cb_drift(const world *s, int64_t first, int64_t last, double t) {
-  for (int64_t a = first; a < last; a += W) {
+/* All nodes to t, but for ranges that are quiet. */
+void cb_drift(const world *s, double t) {
+  const activity *q = quiet(s);
+  const int64_t last = s->nodes;
+  for (int64_t a = 0; a < last; a += W) {
     int32_t some[W];
+    if (q && !q->stirred[a / RANGE]) continue;
     for (int l = 0; l < W; l++) some[l] = (int32_t)(a + l < last ? a + l : last - 1);
     drift(s, some, (vec){0} + t);
   }
@@ -73,26 +105,29 @@ void cb_apply(const world *s, double t, const int32_t *rows, int64_t count) {
 }
 
 #if BALANCED
-/* The nodes' accelerations change by those of nodal forces [node][NR]. */
-void cb_accelerate(const world *s, const double *force) {
-  for (int64_t a = 0; a < s->nodes; a++) {
+/* The accelerations of some nodes, or (NULL) all, change by those of nodal forces [node][NR]. */
+void cb_accelerate(const world *s, const double *force, const int32_t *node, int64_t count) {
+  for (int64_t i = 0; i < count; i++) {
+    const int64_t a = node ? node[i] : i;
     double *r = record_of(s, a);
     impulse(s, a, force + a * NR, r[INVERSE], r + 2 * NR);
   }
 }
 #endif
 
-/* A kick of all nodes by nodal forces [node][NR]. */
-void cb_push(const world *s, double weight, const double *force) {
-  for (int64_t a = 0; a < s->nodes; a++) {
+/* A kick of some nodes by nodal forces [node][NR]. */
+void cb_push(const world *s, double weight, const double *force, const int32_t *node, int64_t count) {
+  for (int64_t i = 0; i < count; i++) {
+    const int64_t a = node[i];
     double *r = record_of(s, a);
     impulse(s, a, force + a * NR, weight * r[INVERSE], r + NR);
   }
 }
 
-/* rates = the records' rates, [node][NR]; zero for components without inertia. */
-void cb_get_rates(const world *s, double *rates) {
-  for (int64_t a = 0; a < s->nodes; a++) {
+/* rates = the records' rates, [node][NR], of some nodes or all; zero for components without inertia. */
+void cb_get_rates(const world *s, double *rates, const int32_t *node, int64_t count) {
+  for (int64_t at = 0; at < count; at++) {
+    const int64_t a = node ? node[at] : at;
     const double *y = record_of(s, a) + NR;
 #if SLOW
     const int64_t k = s->klass ? s->klass[a] : 0;

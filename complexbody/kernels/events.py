@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 #: Blocks of cells whose nodes drift together before the cells act: less than an L1 cache full.
 CHUNK = 8
+#: Nodes that are moved to a window's end together, or are quiet together; a multiple of W.
+RANGE = 16
 
 
 def regions(kernels: Kernels) -> list[EventSource | None]:
@@ -71,10 +73,10 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
         "BALANCED": int(bool(method.balanced)), "DAMPED": int(damped),
         "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
         "CORRECTED": int(bool(method.corrected)), "PACKED": packed_size(kernels),
-        "CHUNK": CHUNK,
+        "CHUNK": CHUNK, "RANGE": RANGE,
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
-    files = ("vectors.h", "tabulated.h", "drifts.h", "events.h")
+    files = ("vectors.h", "tabulated.h", "quiet.h", "drifts.h", "events.h")
     parts += [native.template(name) for name in files]
     if exact:
         parts.append(native.template("lone.h"))

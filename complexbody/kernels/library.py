@@ -37,7 +37,7 @@ class State(ctypes.Structure):
             for name in (
                 "table", "cell", "geometry", "coefficient", "x", "v", "f", "constant", "volume",
                 "inverse_volume", "klass", "alpha", "beta", "eta", "sums", "coordinates", "counted",
-                "forms",
+                "forms", "activity",
             )
         ),
     )  # fmt: skip
@@ -164,8 +164,9 @@ class Kernels:
             "DIAGONAL": int(diagonal), "DAMPED": int(damped),
         }  # fmt: skip
         parts = [f"#define {k} {v}" for k, v in defines.items()]
-        parts += [native.template("vectors.h"), native.template("tabulated.h")]
-        force, energy = [], []
+        files = ("vectors.h", "tabulated.h", "quiet.h")
+        parts += [native.template(name) for name in files]
+        force, energy, rest = [], [], []
         for r, generated in enumerate(d.generated):
             if generated:
                 stored = d.stored[r]
@@ -186,10 +187,15 @@ class Kernels:
                     f"case {r}: tabulated_energy(s->forms + {3 * r + 1}, {common}, out);"
                     f" tabulated_energy(s->forms + {3 * r + 2}, {common}, out + 1); break;"
                 )
+                for i, what in ((0, "force"), (1, "energy"), (2, "energy")):
+                    call = f"tabulated_rest(s->forms + {3 * r + i}, {common}, {what})"
+                    rest.append(f"if (region == {r}) {call};")
         arguments = "region, blocks, first, c, g, k, s"
         parts.append(f"#define FORCE({arguments}) switch (region) {{ {' '.join(force)} }}")
         parts.append(f"#define ENERGY({arguments}, out) switch (region) {{ {' '.join(energy)} }}")
-        return "\n".join([*parts, native.template("driver.c")])
+        head = "RESTLESS(region, blocks, first, c, s, force, energy)"
+        parts.append(f"#define {head} {' '.join(rest)}")
+        return "\n".join([*parts, native.template("driver.c"), native.template("books.c")])
 
     def _compile_tabulated(self) -> None:
         """Forms of regions without generated code: force, stored energy, potential energy."""
@@ -265,11 +271,29 @@ class Kernels:
         self.reset_forces()
         self.c.cb_forces(ctypes.byref(self.state))
 
-    def energies(self) -> Array:
-        """Stored and potential energy of this rank's cells by region, shape (regions, 2) [J]."""
+    def energies(self, state: State | None = None) -> Array:
+        """Stored and potential energy of this rank's cells by region, shape (regions, 2) [J].
+
+        A run that tracks which cells are quiet gives its own ``state``.
+        """
         out = np.zeros((len(self.action.scene.bodies), 2))
-        self.c.cb_energies(ctypes.byref(self.state), native.pointer(out))
+        self.c.cb_energies(ctypes.byref(state or self.state), native.pointer(out))
         return out
+
+    def restless(self) -> tuple[npt.NDArray[np.bool_], bool]:
+        """Chunks (chunks,) with forces at (u, ν) = 0, and whether any cell has an energy there.
+
+        The constant part of generated forces, which is kept apart, does not count.
+        """
+        force, energy = np.zeros(len(self.disc.chunks), np.uint8), np.zeros(1, np.uint8)
+        state, zero = State.from_buffer_copy(self.state), native.aligned(self.x.shape)
+        state.x = zero.ctypes.data
+        self.c.cb_restless(ctypes.byref(state), native.pointer(force), native.pointer(energy))
+        d = self.densities
+        generated = zip(d.generated, d.stored, d.potential, strict=True)
+        parts = [p for made, *both in generated if made for p in both if p is not None]
+        constant = any(not isinstance(p.constant, float) or p.constant != 0.0 for p in parts)
+        return force > 0, bool(energy[0]) or constant
 
     def bytes_per_cell(self) -> float:
         """Memory of all arrays beside dolfinx's own mesh, per cell of this rank."""

@@ -55,6 +55,13 @@ __attribute__((unused)) static void tabulated_energy(const tabulated *t, int64_t
   TABULATED_LOOP(1, *out += out_[0];)
 }
 
+/* Sets *restless if the form of any of these cells is not zero at x. */
+__attribute__((unused)) static void tabulated_rest(const tabulated *t, int64_t real, int64_t blocks, int64_t first,
+                           const int32_t *c, const double *x, const double *coordinates,
+                           uint8_t *restless) {
+  TABULATED_LOOP(LOCAL, for (int i = 0; i < LOCAL; i++) if (!(out_[i] == 0)) *restless = 1;)
+}
+
 /* Element matrices, [block][lane][LOCAL][LOCAL]. */
 void cb_tabulated_matrices(const tabulated *t, int64_t real, int64_t blocks, int64_t first,
                            const int32_t *c, const double *x, const double *coordinates, double *out) {

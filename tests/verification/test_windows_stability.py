@@ -149,7 +149,7 @@ def test_reversible(comm, name):
         part = (balance.held - now)[:, a * n : (a + 1) * n, :]
         np.add.at(change[:, :n], disc.cells[:, a, :], part.transpose(0, 2, 1))
     disc.sum_shared(change[:-1])
-    run.c.cb_accelerate(run._world, native.pointer(change))
+    run.c.cb_accelerate(run._world, native.pointer(change), *run._all)
     run.advance(12)
     fields, rates = state(run)
     assert abs(fields - start[0]).max() < 1e-10 * abs(moved).max()

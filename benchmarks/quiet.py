@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+"""What quiet cells save: a pulse that enters a body at rest, with and without skipping them.
+
+    python benchmarks/quiet.py [--cells 160000] [--repeats 5] [--part 0.1]
+
+The body is a cube of icosahedral quasicrystal (scaled units, six components), hit on a small patch
+of one face; the run lasts ``part`` of the time in which its fastest wave crosses the cube. Times
+are processor times of all steps, the first one included, the smallest of the repeats, with and
+without in turn; the two runs end in the same state to the bit, which is checked.
+
+The same on a body that moves everywhere from the start shows what the watch costs where there is
+nothing to skip: there it is given up at once, and what is left is a test per chunk of cells. The
+last table is by the share of cells that are awake.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+import complexbody as cb
+from complexbody import meshes
+from complexbody.forms import scaled_icosahedral_quasicrystal
+from complexbody.problem import Problem
+
+METHODS = {
+    "Synchronous": cb.Synchronous(),
+    "AVI, balanced": cb.AVI(),
+    "AVI, plain": cb.AVI(balanced=False),
+}
+
+
+def cube(comm: Any, cells: int, everywhere: bool) -> cb.Scene:
+    """A cube of about so many cells, hit on a patch, or moving everywhere from the start."""
+    side = max(2, round((cells / 6) ** (1 / 3)))
+    mesh = meshes.box(comm, (0, 0, 0), (1, 1, 1), (side,) * 3)
+    body = scaled_icosahedral_quasicrystal()
+    if everywhere:
+        wave = lambda x: 1e-3 * np.cos(7 * x[:1] + 3 * x[1:2]) * np.ones((3, 1))  # noqa: E731
+        return cb.Scene(mesh, body, initial=cb.Initial(u=wave, nu=wave))
+
+    def patch(x: Any) -> Any:
+        return (x[0] < 1e-9) & (np.abs(x[1:] - 0.5).max(axis=0) < 1.6 / side)
+
+    return cb.Scene(mesh, body, loads=[cb.Traction(patch, (1.0, 0.3, 0.0), cb.ricker(20.0))])
+
+
+def crossing(scene: cb.Scene) -> float:
+    """Time in which the fastest plane wave along an axis crosses the cube [s]."""
+    problem = Problem(scene)
+    n, H = scene.components, problem.hessian_samples(0)[0]
+    mass = np.r_[np.full(3, scene.bodies[0].density), np.diag(scene.bodies[0].inertia_matrix)]
+    along = H[0 : 3 * n : 3, 0 : 3 * n : 3] / np.sqrt(np.outer(mass, mass))
+    problem.close()
+    return float(1 / np.sqrt(np.linalg.eigvalsh(along).max()))
+
+
+def compare(
+    scene: cb.Scene, method: Any, until: float, repeats: int
+) -> tuple[Any, int, list[float]]:
+    """A run with quiet cells skipped, its steps, and processor times of with and without [s]."""
+    problems, runs = {}, {}
+    for quiet in (True, False):
+        problems[quiet] = Problem(scene)
+        problems[quiet].quiet = quiet
+    best = dict.fromkeys(problems, np.inf)
+    for _ in range(repeats):
+        for quiet, problem in problems.items():
+            run = runs[quiet] = method.prepare(problem, until)
+            steps = round(until / run.step)
+            begun = time.process_time()
+            run.advance(steps)
+            best[quiet] = min(best[quiet], time.process_time() - begun)
+            run.close()
+    ends = [[values.copy() for values in runs[quiet].sample()] for quiet in problems]
+    assert all(map(np.array_equal, *ends)), "skipping quiet cells has changed a bit"
+    for problem in problems.values():
+        problem.close()
+    return runs[True], steps, list(best.values())
+
+
+def by_share(scene: cb.Scene, repeats: int) -> None:
+    """Time of a step over that of a full one, as the pulse spreads."""
+    times: dict[bool, Any] = {}
+    shares: list[float] = []
+    for attempt in range(repeats):
+        for quiet in (True, False):
+            problem = Problem(scene)
+            problem.quiet = quiet
+            run = cb.Synchronous().prepare(problem, 10.0)
+            run.advance(1)
+            found = []
+            for _ in range(60):
+                begun = time.process_time()
+                run.advance(1)
+                found.append(time.process_time() - begun)
+                if quiet and attempt == 0:
+                    shares.append(1.0)
+                    if run.activity is not None and run.activity.state.on:
+                        state = run.activity.state
+                        shares[-1] = state.awake_cells / state.cells
+            run.close()
+            problem.close()
+            times[quiet] = np.minimum(times.get(quiet, np.inf), found)
+    full = float(np.median(times[False]))
+    print("\nawake at a step's end, and its time over a full one's")
+    for i in range(0, 60, 3):
+        print(f"{shares[i]:8.3f} {times[True][i] / full:8.3f}")
+        if shares[i] == 1.0:
+            break
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--cells", type=int, default=160_000)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--part", type=float, default=0.1, help="of the crossing time")
+    options = parser.parse_args()
+    comm = MPI.COMM_SELF
+    pulse = cube(comm, options.cells, everywhere=False)
+    until = options.part * crossing(pulse)
+    head = ("steps", "skipped", "of updates", "of time", "saving")
+    for title, scene in (
+        ("a pulse", pulse),
+        ("moving everywhere", cube(comm, options.cells, True)),
+    ):
+        print(f"\n{title}, {options.part:g} of the crossing time")
+        print(f"{'':16}" + "".join(f"{word:>12}" for word in head))
+        for name, method in METHODS.items():
+            run, steps, (some, full) = compare(scene, method, until, options.repeats)
+            quiet = run.skipped / (run.skipped + run.updates)
+            print(
+                f"{name:16}{steps:12d}{quiet:12.3f}{1 - quiet:12.3f}{some / full:12.3f}"
+                f"{full / some:12.2f}",
+                flush=True,
+            )
+    print(f"{run.problem.disc.count} cells")
+    by_share(pulse, options.repeats)
+
+
+if __name__ == "__main__":
+    main()
