@@ -18,7 +18,7 @@ MPI_PYTEST := $(PYTEST) --color=no -p no:cacheprovider -o faulthandler_timeout=2
 # nproc obeys OMP_NUM_THREADS, which is 1 here.
 RANKS := $(shell n=$$(env -u OMP_NUM_THREADS nproc); echo $$((n < 2 ? n : 2)))
 
-.PHONY: help setup demo test verify test-debian13 lint clean
+.PHONY: help setup demo charts test verify test-debian13 lint clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -30,6 +30,15 @@ demo: setup ## an impact, computed and drawn (results/impact)
 	$(MPIRUN) -n $(RANKS) .venv/bin/complexbody run demos/impact.py --out results/impact
 	@echo; echo "Pictures, and fields for ParaView:"
 	@find results/impact -name '*.png' -o -name '*.xdmf' -o -name '*.bp' | sort | sed 's/^/  /'
+
+# Minutes each. A chart that was interrupted goes on; FRESH=--fresh measures all anew.
+CHART = $(PYTHON) -m complexbody chart benchmarks/scenes/$(1).py --out docs/charts/$(1) $(FRESH)
+
+charts: setup ## speed against accuracy on four scenes (docs/charts), serially, some 20 minutes
+	$(call CHART,bar) --meshes cells=100,200,400,800 --steps 5 --budget 3
+	$(call CHART,phason) --meshes cells=20,40,80 --steps 5 --budget 3
+	$(call CHART,notch) --meshes refine=0.3,0.5,0.8 --steps 5 --budget 4
+	$(call CHART,plate) --meshes refine=0.3,0.45,0.6 --steps 4 --budget 6
 
 # All three are run, whichever fails.
 test: setup ## all but the slow tests: serially, on 2 and on 3 ranks

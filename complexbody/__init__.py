@@ -13,6 +13,7 @@ from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
+from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
 from complexbody.planning import Plan, plan
@@ -20,25 +21,31 @@ from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
 from complexbody.simulate import simulate
+from complexbody.workprecision import Chart, chart
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AVI",
+    "AssembledLeapfrog",
     "Body",
     "BodyForce",
+    "Chart",
     "ComplexBodyError",
     "Fix",
     "Implicit",
     "Initial",
     "LocalLeapfrog",
+    "Newmark",
     "Output",
+    "PetscTS",
     "Plan",
     "Pressure",
     "Result",
     "Scene",
     "Synchronous",
     "Traction",
+    "chart",
     "constant",
     "plan",
     "ramp",

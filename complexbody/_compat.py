@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import ufl
-from dolfinx import cpp, fem, io, jit, la, mesh, plot
+from dolfinx import cpp, fem, geometry, io, jit, la, mesh, plot
 
 # dolfinx 0.5's JIT logs every compilation at level INFO through the root logger.
 for _handler in logging.getLogger().handlers:
@@ -299,10 +299,15 @@ def exterior_facets(domain: mesh.Mesh) -> Ints:
     return np.flatnonzero(touching.array[: points.size_local] == 1).astype(np.int32)
 
 
-def accumulate(function: fem.Function) -> None:
-    """Add what ghosts hold to their owners, then give all copies the owners' values."""
+def add_ghosts(function: fem.Function) -> None:
+    """Add what ghosts hold to their owners; ghosts keep what they hold."""
     mode = la.ScatterMode.add if hasattr(la, "ScatterMode") else la.InsertMode.add
     function.x.scatter_reverse(mode)
+
+
+def accumulate(function: fem.Function) -> None:
+    """Add what ghosts hold to their owners, then give all copies the owners' values."""
+    add_ghosts(function)
     function.x.scatter_forward()
 
 
@@ -313,3 +318,13 @@ def expression_kernel(value: Any, points: Array, comm: Any) -> tuple[Any, Any]:
         options = {"form_compiler_params": {"scalar_type": "double"}, "jit_params": JIT_OPTIONS}
     made = jit.ffcx_jit(comm, (value, points), **options)
     return made, made[0].tabulate_tensor_float64
+
+
+def closest_cells(domain: mesh.Mesh, points: Array) -> Ints:
+    """This rank's cell nearest to each point (points, 3): the one that it lies in, if any."""
+    tdim = domain.topology.dim
+    make = geometry.bb_tree if hasattr(geometry, "bb_tree") else geometry.BoundingBoxTree
+    middles = geometry.create_midpoint_tree(
+        domain, tdim, np.arange(cell_count(domain)[0], dtype=np.int32)
+    )
+    return geometry.compute_closest_entity(make(domain, tdim), middles, domain, points)

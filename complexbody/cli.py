@@ -19,9 +19,11 @@ from typing import Any, NoReturn
 
 from mpi4py import MPI
 
-from complexbody import __version__, cli_plan, commands
+from complexbody import __version__, cli_chart, cli_plan, commands
+from complexbody.cli_texts import EPILOG, RUN_EPILOG
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
+from complexbody.integrators.petsc_ts import FORMS
 from complexbody.masses import SCHEMES
 from complexbody.output import CELL_FIELDS, NODE_FIELDS, STEP_FIELDS
 from complexbody.together import (
@@ -35,43 +37,6 @@ from complexbody.together import (
     signals,
     together,
 )
-
-_EPILOG = """\
-examples:
-  complexbody check demos/impact.py               what would it do, and how long would it take?
-  complexbody plan demos/impact.py                what does it need, and what not?
-  complexbody run demos/impact.py                 as the file says
-  complexbody run demos/impact.py --set cells=80 --until 2e-5 --out results/fine
-  mpirun -n 4 complexbody run demos/impact.py     the same on four processes
-  complexbody info                                versions, compiler, what is missing
-
-a scene file is a Python file with
-  import complexbody as cb
-  def scene(comm, cells=40):                      parameters are set by --set cells=80
-      return cb.Scene(mesh, body, supports=…, loads=…, initial=…)
-and, if it likes,
-  DEFAULTS = dict(until=1e-5, every=1e-7)         what the options of run override
-  def check(result): ...                          raises AssertionError if the physics is wrong
-  def picture(result, path): ...                  draws into the file path
-
-exit codes:
-  0  done                          4    the run diverged
-  1  a bug of complexbody          5    the scene file's check failed
-  2  wrong input: what and where   130  stopped by Ctrl-C
-  3  something is not installed    143  stopped by SIGTERM
-"""
-_RUN_EPILOG = """\
-Options that are not given are taken from DEFAULTS of the scene file, then as shown here. Results go
-to DIR: run.json (what was run, and how it ended), ledger.csv, FIELD.xdmf with FIELD.h5 (open the
-.xdmf in ParaView), probe-NAME.csv and picture.png.
-
-examples:
-  complexbody run demos/impact.py --set refine=1.5 --every 1e-7 --out results/fine
-  complexbody run demos/impact.py --dissipation forward --start one-sided
-  complexbody run demos/impact.py --integrator local-leapfrog --levels 3
-  complexbody run demos/impact.py --fields u,stress --probe tip=1,0.5,0 --no-picture
-  mpirun -n 4 complexbody run demos/impact.py
-"""
 
 
 class _Parser(argparse.ArgumentParser):
@@ -93,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     main = _Parser(
         prog="complexbody",
         description="Dynamics of complex bodies by variational integrators, on FEniCSx.",
-        epilog=_EPILOG,
+        epilog=EPILOG,
         formatter_class=_wide,
         allow_abbrev=False,
     )
@@ -109,7 +74,7 @@ def parser() -> argparse.ArgumentParser:
         made.add_argument("--debug", action="store_true", help="show tracebacks of errors")
         return made
 
-    run = command("run", commands.run, "run a scene file", _RUN_EPILOG)
+    run = command("run", commands.run, "run a scene file", RUN_EPILOG)
     _scene(run)
     _integrator(run)
     _output(run)
@@ -123,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
     planned = command("plan", cli_plan.command, cli_plan.TEXT)
     _scene(planned)
     _integrator(planned)
+    cli_chart.add(command, _scene)
     command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
     return main
 
@@ -188,14 +154,23 @@ def _integrator(to: argparse.ArgumentParser) -> None:
         help="implicit: a Newton at each node (default), or SNES with χ integrated in full",
     )  # fmt: skip
     group.add_argument(
-        "--tolerance", metavar="EPS", type=float, help="implicit: of the residual; default 1e-12"
+        "--tolerance", metavar="EPS", type=float,
+        help="implicit, newmark, petsc-ts: of the residual; default 1e-12, 1e-10, 1e-10",
     )
     group.add_argument(
         "--monitor", action="store_true", default=None, help="implicit: print SNES's residuals"
     )
     group.add_argument(
         "--petsc", metavar="NAME=VALUE", action="append", default=[],
-        help="implicit: a PETSc option of SNES, such as ksp_type=gmres; repeatable",
+        help="implicit, newmark, petsc-ts: a PETSc option, such as ksp_type=gmres; repeatable",
+    )  # fmt: skip
+    group.add_argument(
+        "--force", choices=("assembly", "matrix"),
+        help="assembled-leapfrog: assembled at each step (default), or a product",
+    )  # fmt: skip
+    group.add_argument(
+        "--kind", choices=tuple(FORMS),
+        help="petsc-ts: generalised-α (default), Runge–Kutta, trapezoidal or midpoint rule",
     )  # fmt: skip
     group.add_argument(
         "--levels", metavar="L", type=int,

@@ -28,6 +28,7 @@ from complexbody.files import on_first_rank
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
+from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
 from complexbody.output import NODE_FIELDS, Output, Probes
@@ -43,11 +44,12 @@ from complexbody.together import Interrupted, say, together
 #: Integrators by the name that --integrator takes; the first is the default.
 INTEGRATORS = {
     "synchronous": Synchronous, "avi": AVI, "local-leapfrog": LocalLeapfrog, "implicit": Implicit,
+    "assembled-leapfrog": AssembledLeapfrog, "newmark": Newmark, "petsc-ts": PetscTS,
 }  # fmt: skip
 _OPTIONS = (
     "step", "safety", "dissipation", "start", "critical", "unstable_ok", "schedule", "balanced",
     "corrected", "stabilisation", "levels", "order", "quadrature", "tolerance", "iterations",
-    "monitor", "options",
+    "monitor", "options", "force", "kind",
 )  # fmt: skip
 
 

@@ -48,6 +48,10 @@ class CommandError(ComplexBodyError):
     """The command line or a scene file is wrong."""
 
 
+class ChartError(ComplexBodyError, ValueError):
+    """A chart cannot be made of this scene, or its file is of another chart."""
+
+
 class MissingPackage(ComplexBodyError, ImportError):
     """An optional package or a compiler is not there; the message has the install line."""
 

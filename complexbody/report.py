@@ -94,6 +94,8 @@ def step(run: Any, method: Any, until: float | None) -> str:
         name = "coarse step" if hasattr(method, "levels") else "window"
         text = f"{name} {step:.6g} s, {step / critical:.3g} times the smallest cell's critical step"
         return entry("step", f"{text} of {critical:.6g} s{count}")
+    if not np.isfinite(critical):
+        return entry("step", f"{step:.6g} s, which stability does not limit{count}")
     share = step / critical
     text = f"{step:.6g} s, {share:.3g} of the critical {critical:.6g} s{count}"
     return entry("step", text + (" (UNSTABLE)" if share > 1 + 1e-9 else ""))

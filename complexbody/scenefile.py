@@ -3,7 +3,8 @@
 
 A scene file has ``def scene(comm, **parameters) -> cb.Scene`` and, if it likes, ``DEFAULTS`` (a
 dict of :data:`SETTINGS`), ``check(result) -> str``, which raises AssertionError if the physics is
-wrong, and ``picture(result, path)``. All three functions are called on all ranks.
+wrong, and ``picture(result, path)``; for charts, ``exact(t, **parameters)``, a dict with some of u,
+nu, u_dot, nu_dot at t, functions of x (3, npts). All are called on all ranks.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import linecache
 import sys
 import traceback
 import types
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -178,6 +179,20 @@ class SceneFile:
             )
         return made
 
+    @property
+    def source(self) -> bytes:
+        """The file's content."""
+        return self._source
+
+    def exact(self, t: float, **parameters: Any) -> Any:
+        """What the file's ``exact(t, …)`` says, given those of the parameters that it takes.
+
+        Raises:
+            CommandError: naming file, line and exception.
+        """
+        with self._blamed("exact()"):
+            return self.module.exact(t, **accepted(self.module.exact, parameters))
+
     def has(self, name: str) -> bool:
         """Whether the file has a function ``name``."""
         return callable(getattr(self.module, name, None))
@@ -238,6 +253,14 @@ class SceneFile:
 
 def _a(thing: Any) -> str:
     return "None" if thing is None else f"a {type(thing).__name__}"
+
+
+def accepted(function: Callable[..., Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the values that a function has parameters for, by name."""
+    known = inspect.signature(function).parameters
+    if any(p.kind is inspect.Parameter.VAR_KEYWORD for p in known.values()):
+        return dict(values)
+    return {name: value for name, value in values.items() if name in known}
 
 
 def assignments(texts: Sequence[str]) -> dict[str, Any]:

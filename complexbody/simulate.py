@@ -21,6 +21,7 @@ from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
 from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
+from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
 from complexbody.output import Output, Writer
@@ -31,7 +32,9 @@ from complexbody.result import Result, Statistics
 from complexbody.scene import Scene
 
 Array = npt.NDArray[np.float64]
-Integrator = Synchronous | AVI | LocalLeapfrog | Implicit
+Integrator = (
+    Synchronous | AVI | LocalLeapfrog | Implicit | AssembledLeapfrog | Newmark | PetscTS
+)  # fmt: skip
 
 
 def simulate(

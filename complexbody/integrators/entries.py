@@ -72,13 +72,15 @@ class Run(Protocol):
     Attributes:
         step, critical: Step (or window) and critical synchronous step [s].
         steps: Done so far; time: reached [s].
-        updates: Cell updates of this rank.
     """
 
     step: float
     critical: float
     steps: int
-    updates: int
+
+    @property
+    def updates(self) -> int:
+        """Cell updates of this rank."""
 
     @property
     def time(self) -> float:

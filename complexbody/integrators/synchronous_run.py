@@ -27,6 +27,22 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 
+def refuse_partial(problem: Problem) -> None:
+    """Refuse moving supports of some components of a descriptor whose inertia couples them.
+
+    Raises:
+        IntegratorError: on all ranks.
+    """
+    n_u, (rows, columns) = problem.scene.displacement, problem.moving
+    masses, nodes = problem.masses, rows[columns >= n_u]
+    bad = not np.all(masses.fixed[masses.classes[nodes], n_u:])
+    if problem.comm.allreduce(bool(bad), op=MPI.LOR):
+        raise IntegratorError(
+            "A moving support prescribes some components of a descriptor whose inertia or "
+            "viscosity couples them. Prescribe all components there, or diagonalise the matrix."
+        )
+
+
 class SynchronousRun(ForceRun):
     """A synchronous run in progress.
 
@@ -41,7 +57,7 @@ class SynchronousRun(ForceRun):
         self.method = method
         disc, kernels, masses = problem.disc, problem.kernels, problem.masses
         if not masses.diagonal:  # the same on all ranks, unlike what moves there
-            self._refuse_partial()
+            refuse_partial(problem)
         kernels.select(masses.diagonal, masses.damped)
         self.c, self.state = kernels.c, ctypes.byref(kernels.state)
         rec = masses.recursion(step, method.dissipation)
@@ -70,16 +86,6 @@ class SynchronousRun(ForceRun):
         kernels.x[:-1, : disc.n] = problem.initial_fields
         self.support_work = 0.0
         kernels.reset_forces()
-
-    def _refuse_partial(self) -> None:
-        n_u, (rows, columns) = self.problem.scene.displacement, self.problem.moving
-        masses, nodes = self.problem.masses, rows[columns >= n_u]
-        bad = not np.all(masses.fixed[masses.classes[nodes], n_u:])
-        if self.problem.comm.allreduce(bool(bad), op=MPI.LOR):
-            raise IntegratorError(
-                "A moving support prescribes some components of a descriptor whose inertia or "
-                "viscosity couples them. Prescribe all components there, or diagonalise the matrix."
-            )
 
     # --- steps -------------------------------------------------------------------------------
 
