@@ -23,6 +23,7 @@ from complexbody.body import Body
 from complexbody.convexity import Convexity, Range
 from complexbody.discretisation import Discretisation
 from complexbody.errors import agree
+from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
 from complexbody.masses import Masses
@@ -165,10 +166,13 @@ class Problem:
         self.kernels.select(self.masses.diagonal, damped=False)
         rows, columns = np.nonzero(moving[disc.dof])
         self.moving = rows.astype(np.int64), columns.astype(np.int32)
-        number = disc.number
-        self.load_position = number[self.loads.node] * disc.record + self.loads.component
-        self.load_group, self.load_value = self.loads.group, self.loads.value
+        self._lay_loads()
         self._initial(*self.start, fixed)
+
+    def _lay_loads(self) -> None:
+        loads, disc = self.loads, self.disc
+        self.load_position = disc.number[loads.node] * disc.record + loads.component
+        self.load_group, self.load_value = loads.group, loads.value
 
     def stiffen(self, step: float | Array) -> None:
         """Give nodes the inertia Ω + h²S/4 of an implicit self-action; kept by ``arrange``.
@@ -195,6 +199,19 @@ class Problem:
         x0[rows, columns] = sup.targets(dofs, columns, 0.0)
         v0[rows, columns] = 0.0
         self.initial_fields, self.initial_rates = x0, v0
+
+    def restart(self, fields: Array, rates: Array, t: float) -> None:
+        """Let the next runs begin with another state, at the time ``t`` of the scene's histories.
+
+        Args:
+            fields, rates: Of this rank's geometry nodes, shape (geometry nodes, n).
+            t: Time [s], from which runs count theirs; runs already made are of no more use.
+        """
+        self.start = fields, rates
+        for histories in (self.loads.histories, self.supports.histories):
+            histories[:] = [shifted(history, t) for history in histories]
+        self._lay_loads()
+        self._initial(fields, rates, self.supports.fixed[self.disc.dof])
 
     def targets(self, t: float) -> Array:
         """Prescribed values of the moving components at time t, in the order of ``moving``."""

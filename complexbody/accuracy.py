@@ -1,0 +1,427 @@
+# SPDX-License-Identifier: LGPL-3.0-or-later
+r"""The cheapest integrator and step that meet an accuracy, found by short runs on the scene itself.
+
+The *norm* is that of the charts: the larger of the relative L2 errors of u and ν at the end, over
+the largest norm of either in the run. At a few moments of the motion windows of it are run, of about
+a hundredth of the whole (:mod:`complexbody.pilots`): by each method that may be worth it, at its
+stable limit, against Richardson's extrapolation of two steps of the first of them; and with the
+forces that masses without the mesh's leading error would feel. Amplitudes of parting grow as a power
+p of time, 0 ≤ p ≤ 1, seen from the windows' middles to their ends (1 where phases drift apart, 0 for
+the ripple of cells that act alone), and as the square of the step. So
+
+.. math:: e = \langle a(w)\rangle\,(T/w)^p / \text{largest norm}.
+
+The first window decides, before the run where something moves from the start. Two more, at states of
+the run itself, verify it by halving its steps: the run begins anew if the request would be missed.
+"""
+
+from __future__ import annotations
+
+import time as clock
+import warnings
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from complexbody.errors import AccuracyError
+from complexbody.histories import Constant
+from complexbody.integrators.asynchronous import AVI
+from complexbody.integrators.entries import Run
+from complexbody.integrators.implicit import Implicit
+from complexbody.integrators.local_leapfrog import LocalLeapfrog
+from complexbody.integrators.synchronous import Synchronous
+from complexbody.pilots import Moment, Piece, Pilots, attempt, moment_of
+from complexbody.planning import EVENT
+from complexbody.precheck import limits
+from complexbody.problem import Problem
+from complexbody.result import Result
+from complexbody.scene import Scene
+from complexbody.simulate import Simulation, require_until
+
+Array = npt.NDArray[np.float64]
+
+#: A window is this part of the motion, and at least so many of the largest cell's critical steps.
+PART, STEPS = 120, 5.4
+#: Where windows begin, as parts of the motion; the first one later if nothing moves at its start.
+WINDOWS, LATE = (0.0, 0.4, 0.7), 0.15
+#: Time may take this share of what the mesh leaves of the request, and at least that of all of it.
+SHARE, LEAST = 0.6, 0.15
+#: Methods are tried whose expected cost is at most so many times the least …
+DEAR = 3.0
+#: … those with local steps only if these would save so much at best.
+GAIN = 1.5
+#: Updates of local steps over those of each cell's own critical step, as experience has them.
+ROUNDED = {"LocalLeapfrog": 1.5, "AVI": 1.4}
+#: Times of an event of plain windows over a synchronous update (2D, 3D), as docs/claims.md has them.
+PLAIN = (1.1, 1.2)
+#: Processor time is believed where windows took so long [s]; else updates are counted.
+GRAIN = 0.02
+#: A run under way goes on with what would cost at most so many times the least.
+KEEP = 1.5
+#: Share of the request that the advised mesh leaves to its own error.
+ROOM = 0.7
+#: Loads act from where they reach this part of their largest factor.
+ONSET = 1e-2
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What was asked for, and what was found.
+
+    Attributes:
+        asked: The relative error; norm: of what.
+        method: What ran; factor: its steps over those at its stable limit.
+        predicted: Error in time before the run; verified: by halving steps in windows of the run.
+        mesh: Estimate of the mesh's own error; a few tens of per cent off where waves span many
+            cells, too small where singularities rule it.
+        met: Whether ``verified`` and ``mesh`` together are at most what was asked.
+        tried: Methods, with the cost (over the least) at which they would meet the request.
+        updates, share: Cell updates of all pilot runs over those of the run; the same in time.
+        restarts: How often the run began anew.
+    """
+
+    asked: float
+    norm: str
+    method: Any
+    factor: float
+    predicted: float
+    verified: float
+    mesh: float
+    met: bool
+    tried: dict[str, float] = field(default_factory=dict)
+    updates: float = 0.0
+    share: float = 0.0
+    restarts: int = 0
+
+    def __str__(self) -> str:
+        others = ", ".join(f"{name} {cost:.2g}" for name, cost in self.tried.items())
+        return (
+            f"asked {self.asked:.3g} ({self.norm}); in time {self.verified:.2g} by halved steps "
+            f"({self.predicted:.2g} expected), of the mesh about {self.mesh:.2g}: "
+            f"{'met' if self.met else 'MISSED'}; {type(self.method).__name__} at "
+            f"{self.factor:.3g} of its stable limit (costs: {others}); pilot runs "
+            f"{self.updates:.2g} of the run's updates, {self.share:.2g} of its time"
+            + (f"; begun anew {self.restarts} times" if self.restarts else "")
+        )
+
+
+class _Again(Exception):  # noqa: N818 - no error: the run begins anew
+    """The run would miss the request."""
+
+
+@dataclass
+class _Found:
+    """Amplitudes of parting at windows' middles and ends, (2,) each: of time, and of the mesh."""
+
+    time: list[tuple[Array, Array]] = field(default_factory=list)
+    mesh: list[tuple[Array, Array]] = field(default_factory=list)
+
+
+class Accurate:
+    """A simulation whose integrator and step are chosen; collective.
+
+    Args:
+        scene: What to simulate.
+        asked: Relative error to meet.
+        integrator: None: it is chosen.
+        until: End of the run [s].
+        options: As for :class:`complexbody.simulate.Simulation`.
+
+    Attributes:
+        simulation: The simulation, ready to run; looks: how often this looks at it.
+        method: Its integrator.
+
+    Raises:
+        AccuracyError: for what is no accuracy, beside an integrator, or what the mesh cannot meet.
+        ComplexBodyError: for a scene that cannot be run.
+    """
+
+    looks = 40
+
+    def __init__(
+        self, scene: Scene, asked: float, integrator: Any = None, *, until: float, **options: Any
+    ) -> None:
+        if integrator is not None:
+            raise AccuracyError(
+                "simulate: accuracy= chooses the integrator, and integrator= is given as well. "
+                "Give one of them."
+            )
+        if not (np.isfinite(asked) and 0 < asked < 1):
+            raise AccuracyError(
+                f"simulate: accuracy is {asked}. Give a relative error between 0 and 1."
+            )
+        require_until(until)
+        self.scene, self.asked, self.until, self.options = scene, asked, until, options
+        begun = clock.process_time()
+        self.pilots = Pilots(scene, options.get("plan", True))
+        self.comm = self.pilots.comm
+        try:
+            self._prepare()
+            self.spent, self._running = clock.process_time() - begun, True
+            self.simulation = Simulation(scene, self.method, until=until, watch=self, **options)
+        except BaseException:
+            self.pilots.close()
+            raise
+
+    def _prepare(self) -> None:
+        pilots, problem = self.pilots, self.pilots.problem
+        self.scale, self.found, self.work = np.zeros(2), _Found(), 0
+        self.factor, self.predicted, self.restarts = 1.0, np.nan, 0
+        self.tried: dict[str, float] = {}
+        self._chosen = self._running = False
+        self.begin, moving = self._onset()
+        self.length = self.until - self.begin
+        found = limits(problem, "exact")
+        gain = found.uniform / found.local if found.local > 0 else 1.0
+        self.candidates = self._candidates(gain)
+        self.method = self.candidates[0][0]
+        longest = found.largest if self.method.asynchronous else found.smallest
+        shortest = STEPS * longest if np.isfinite(longest) else 0.0
+        self.window = min(max(self.length / PART, shortest), self.length / 4)
+        self.pending = [self.begin + part * self.length for part in WINDOWS]
+        if moving:
+            self._decide(pilots.start)
+        else:
+            self.pending[0] = self.begin + LATE * self.length
+
+    def _onset(self) -> tuple[float, bool]:
+        """When something begins to move [s], and whether it moves from the start; collective."""
+        problem, start = self.pilots.problem, self.pilots.start
+        loads, supports = problem.loads.histories, problem.supports.histories[1:]
+        moving = bool(np.any(start.fields) or np.any(start.rates))
+        moving |= problem.kernels.constant is not None
+        times = np.linspace(0.0, self.until, 2001)
+        first = self.until
+        for history, rest in [(h, 0.0) for h in loads] + [(h, None) for h in supports]:
+            factor = np.asarray(history(times), dtype=np.float64)
+            factor = np.abs(factor - (factor[0] if rest is None else rest))
+            acts = np.flatnonzero(factor > ONSET * factor.max())
+            if len(acts):
+                first = min(first, float(times[max(acts[0] - 1, 0)]))
+            moving |= isinstance(history, Constant)
+        moving = bool(self.comm.allreduce(moving, op=MPI.LOR))
+        first = float(self.comm.allreduce(first, op=MPI.MIN))
+        return (0.0, True) if moving or first >= 0.9 * self.until else (first, False)
+
+    def _candidates(self, gain: float) -> list[tuple[Any, float]]:
+        """Methods with their cost per update, the one expected to be the cheapest first."""
+        three = self.scene.mesh.geometry.dim > 2
+        if self.pilots.problem.convexity is not None:
+            return [(Implicit(), 1.0)]
+        out = [(Synchronous(), 1.0, 1 / 0.9)]
+        if gain >= GAIN:
+            local, avi = EVENT["LocalLeapfrog()"][three], EVENT["AVI()"][three]
+            out += [
+                (LocalLeapfrog(), local, ROUNDED["LocalLeapfrog"] / gain / 0.9),
+                (AVI(), avi, ROUNDED["AVI"] / gain / 0.45),
+                (AVI(balanced=False), PLAIN[three], ROUNDED["AVI"] / gain / 0.45),
+            ]
+        out.sort(key=lambda entry: entry[1] * entry[2])
+        least = out[0][1] * out[0][2]
+        return [(m, price) for m, price, updates in out if price * updates <= DEAR * least]
+
+    # --- windows -------------------------------------------------------------------------------
+
+    def _piece(self, method: Any, begin: Moment, extra: Array | None = None) -> Piece:
+        made = self.pilots.run(method, begin, self.window, extra)
+        self.work += made.work
+        return made
+
+    def _pair(self, method: Any, begin: Moment) -> tuple[Piece, list[Moment]]:
+        """A run through a window, and its extrapolation with one of half the steps."""
+        coarse = self._piece(method, begin)
+        fine = self._piece(_halved(method, 0.5 * self.window / coarse.steps), begin)
+        # Of second order in steps whose ratio is that of their numbers.
+        share = 1.0 / ((fine.steps / coarse.steps) ** 2 - 1.0)
+        ends = [f + (f - c) * share for f, c in zip(fine.ends, coarse.ends, strict=True)]
+        return coarse, ends
+
+    def _mesh(self, method: Any, begin: Moment, piece: Piece) -> None:
+        """How the motion would part from one with masses of no leading error."""
+        extra = self.pilots.defect(begin, piece.ends[1])
+        other = self._piece(method, begin, extra)
+        self.found.mesh.append(self._amplitudes(begin, piece.ends, other.ends))
+
+    def _amplitudes(
+        self, begin: Moment, ends: Any, exact: Any, reach: Array | None = None
+    ) -> tuple[Array, Array]:
+        middle, end = (e - x for e, x in zip(ends, exact, strict=True))
+        if reach is None:
+            reach = self.pilots.reach(begin, end)
+        return self.pilots.amplitude(middle, reach), self.pilots.amplitude(end, reach)
+
+    def _see(self, moment: Moment, whole: bool) -> None:
+        """Let scales know a state; the whole: what its rates will make of it, too."""
+        norms = self.pilots.norms(moment)
+        if whole:
+            reach = self.pilots.reach(moment, moment)
+            norms = self.pilots.amplitude(moment, reach)
+        self.scale = np.maximum(self.scale, norms)
+
+    def _error(self, parts: list[tuple[Array, Array]]) -> float:
+        """Relative error at the end from amplitudes in windows."""
+        if not parts:
+            return 0.0
+        middle, end = (np.mean([p[i] for p in parts], axis=0) for i in (0, 1))
+        with np.errstate(all="ignore"):
+            power = np.clip(np.nan_to_num(np.log2(end / middle), nan=1.0), 0.0, 1.0)
+            relative = end * (self.length / self.window) ** power
+            relative = relative / self.pilots.floored(self.scale)
+        return float(np.max(np.where(np.isnan(relative), 0.0, relative)))
+
+    def _decide(self, begin: Moment) -> None:
+        """Choose by the first window; collective.
+
+        Raises:
+            AccuracyError: if the mesh cannot meet the request.
+        """
+        self.pending.pop(0)
+        first, price = self.candidates[0]
+        piece, exact = self._pair(first, begin)
+        self._see(begin, whole=True)
+        self._see(piece.ends[1], whole=False)
+        self._mesh(first, begin, piece)
+        budget = self._budget()
+        pieces = [(first, price, piece)]
+        for method, cost in self.candidates[1:]:
+            made = attempt(lambda method=method: self._piece(method, begin))
+            if made is not None and made.finite:
+                pieces.append((method, cost, made))
+        timed = all(made.measured > GRAIN for *_, made in pieces)
+        rows = []
+        for method, cost, made in pieces:
+            parts = self._amplitudes(begin, made.ends, exact)
+            error = self._error([parts])
+            factor = min(1.0, float(np.sqrt(budget / error))) if error > 0 else 1.0
+            spent = (made.seconds if timed else made.updates * cost) / factor
+            rows.append((spent, method, factor, 0.5 * self.window / made.steps, parts))
+        best = min(rows, key=lambda row: row[0])
+        self.tried = {_name(row[1]): row[0] / best[0] for row in rows}
+        self._chosen = True
+        if self._running:
+            # The run is under way with the first of them: good enough goes on.
+            if rows[0][2] == 1.0 and rows[0][0] <= KEEP * best[0]:
+                best = rows[0]
+            else:
+                self._take(*best[1:])
+                raise _Again
+        self._take(*best[1:])
+
+    def _take(self, method: Any, factor: float, step: float, parts: tuple[Array, Array]) -> None:
+        """Use a method at this factor of its limit, where it makes ``step`` and parts so far."""
+        self._limit, self._step, self._parts = method, step, parts
+        self._set(factor)
+        self.predicted = self._error(self.found.time)
+
+    def _set(self, factor: float) -> None:
+        self.factor = factor
+        self.found.time = [(self._parts[0] * factor**2, self._parts[1] * factor**2)]
+        self.method = method = self._limit
+        if isinstance(method, Implicit):
+            step = self.until / np.ceil(self.until / (factor * self._step) * (1 - 1e-12))
+            self.method = replace(method, step=float(step))
+        elif factor < 1:
+            self.method = replace(method, safety=factor * method.safety)
+
+    def _budget(self) -> float:
+        """What is left for time; collective.
+
+        Raises:
+            AccuracyError: if the mesh leaves nothing.
+        """
+        mesh = self._error(self.found.mesh)
+        if mesh > self.asked and self.pending:
+            size, part = self.pilots.cell_size(), float(np.sqrt(ROOM * self.asked / mesh))
+            raise AccuracyError(
+                f"A relative error of {self.asked:g} is asked for, but the mesh's own is about "
+                f"{mesh:.2g}. Give cells {part:.2g} times as long (median {size * part:.3g} m in "
+                f"place of {size:.3g} m), or ask for {1.3 * mesh:.1g}."
+            )
+        return max(SHARE * (self.asked - mesh), LEAST * self.asked)
+
+    def look(self, run: Run, problem: Problem) -> None:
+        """Look at the run: norms, and windows where they are due; collective.
+
+        Raises:
+            AccuracyError: if the mesh cannot meet the request.
+        """
+        begun = clock.process_time()
+        moment = moment_of(run, problem)
+        self.scale = np.maximum(self.scale, self.pilots.norms(moment))
+        try:
+            if self.pending and run.time >= self.pending[0] * (1 - 1e-9):
+                if self._chosen:
+                    self._verify(moment)
+                else:
+                    self._decide(moment)
+        finally:
+            self.spent += clock.process_time() - begun
+
+    def _verify(self, begin: Moment) -> None:
+        """Halve the steps of the run's own method in a window; collective."""
+        self.pending.pop(0)
+        piece, exact = self._pair(self.method, begin)
+        self.found.time.append(self._amplitudes(begin, piece.ends, exact))
+        self._mesh(self.method, begin, piece)
+        budget, error = self._budget(), self._error(self.found.time)
+        if error > budget / SHARE and self.pending and self.restarts == 0:
+            self._set(0.9 * self.factor * float(np.sqrt(budget / error)))
+            raise _Again
+
+    # --- the run -------------------------------------------------------------------------------
+
+    def run(self) -> Result:
+        """Run it, anew if need be; collective, once.
+
+        Raises:
+            AccuracyError: if the mesh cannot meet the request.
+            ComplexBodyError: as for any simulation.
+        """
+        try:
+            while True:
+                try:
+                    result = self.simulation.run()
+                    break
+                except _Again:
+                    self.restarts += 1
+                    self.pending = [self.begin + part * self.length for part in WINDOWS[1:]]
+                    self.simulation = Simulation(
+                        self.scene, self.method, until=self.until, watch=self, **self.options
+                    )
+            result.accuracy = self._record(result)
+        finally:
+            self.pilots.close()
+        return result
+
+    def _record(self, result: Result) -> Accuracy:
+        verified, mesh = self._error(self.found.time), self._error(self.found.mesh)
+        spent = float(self.comm.allreduce(self.spent, op=MPI.MAX))
+        made = Accuracy(
+            self.asked, "fields", self.method, self.factor, self.predicted, verified, mesh,
+            verified + mesh <= self.asked, self.tried, self.work / max(result.stats.updates, 1),
+            spent / max(result.stats.stepping, 1e-12), self.restarts,
+        )  # fmt: skip
+        if not made.met and self.comm.rank == 0:
+            warnings.warn(
+                f"The run's error is about {verified + mesh:.2g} ({verified:.2g} in time, "
+                f"{mesh:.2g} of the mesh), more than the {self.asked:g} asked for.",
+                UserWarning, stacklevel=3,
+            )  # fmt: skip
+        return made
+
+
+def _halved(method: Any, step: float) -> Any:
+    """A method whose every step is half of what it was, with ``step`` [s] all together."""
+    if isinstance(method, AVI):
+        return replace(method, safety=0.5 * method.safety)
+    if isinstance(method, LocalLeapfrog):
+        return replace(method, safety=0.5 * method.safety, step=0.5 * step)
+    return replace(method, step=0.5 * step)
+
+
+def _name(method: Any) -> str:
+    plain = isinstance(method, AVI) and not method.balanced
+    return type(method).__name__ + (" plain" if plain else "")
