@@ -61,6 +61,8 @@ PLAIN = (1.1, 1.2)
 GRAIN = 0.02
 #: A run under way goes on with what would cost at most so many times the least.
 KEEP = 1.5
+#: One window alone refuses where the mesh's error seems to be so many times what is asked.
+DOUBT = 1.5
 #: Share of the request that the advised mesh leaves to its own error.
 ROOM = 0.7
 #: Loads act from where they reach this part of their largest factor.
@@ -168,7 +170,8 @@ class Accurate:
 
     def _prepare(self) -> None:
         pilots, problem = self.pilots, self.pilots.problem
-        self.scale, self.found, self.work = np.zeros(2), _Found(), 0
+        self.scale, self._own, self._most = (np.zeros(2) for _ in range(3))
+        self.found, self.work = _Found(), 0
         self.factor, self.predicted, self.restarts = 1.0, np.nan, 0
         self.tried: dict[str, float] = {}
         self._chosen = self._running = False
@@ -251,15 +254,15 @@ class Accurate:
         middle, end = (e - x for e, x in zip(ends, exact, strict=True))
         if reach is None:
             reach = self.pilots.reach(begin, end)
-        return self.pilots.amplitude(middle, reach), self.pilots.amplitude(end, reach)
+        parts = (self.pilots.amplitude(m, reach, 0.5) for m in (middle, end))
+        own = self.pilots.floored(self._own)
+        middle, end = (np.where(own > 0, p / np.where(own > 0, own, 1.0), 0.0) for p in parts)
+        return middle, end
 
-    def _see(self, moment: Moment, whole: bool) -> None:
-        """Let scales know a state; the whole: what its rates will make of it, too."""
-        norms = self.pilots.norms(moment)
-        if whole:
-            reach = self.pilots.reach(moment, moment)
-            norms = self.pilots.amplitude(moment, reach)
-        self.scale = np.maximum(self.scale, norms)
+    def _see(self, moment: Moment) -> None:
+        """Know the amplitudes of the motion itself at a state: what its rates make of it, too."""
+        self._own = self.pilots.amplitude(moment, self.pilots.reach(moment, moment))
+        self._most = np.maximum(self._most, self._own)
 
     def _error(self, parts: list[tuple[Array, Array]]) -> float:
         """Relative error at the end from amplitudes in windows."""
@@ -269,7 +272,8 @@ class Accurate:
         with np.errstate(all="ignore"):
             power = np.clip(np.nan_to_num(np.log2(end / middle), nan=1.0), 0.0, 1.0)
             relative = end * (self.length / self.window) ** power
-            relative = relative / self.pilots.floored(self.scale)
+            # What viscosity takes from the motion it takes from its errors as well.
+            relative = relative * self._own / self._most
         return float(np.max(np.where(np.isnan(relative), 0.0, relative)))
 
     def _decide(self, begin: Moment) -> None:
@@ -281,8 +285,7 @@ class Accurate:
         self.pending.pop(0)
         first, price = self.candidates[0]
         piece, exact = self._pair(first, begin)
-        self._see(begin, whole=True)
-        self._see(piece.ends[1], whole=False)
+        self._see(piece.ends[1])
         self._mesh(first, begin, piece)
         budget = self._budget()
         pieces = [(first, price, piece)]
@@ -333,7 +336,8 @@ class Accurate:
             AccuracyError: if the mesh leaves nothing.
         """
         mesh = self._error(self.found.mesh)
-        if mesh > self.asked and self.pending:
+        sure = len(self.found.mesh) > 1
+        if mesh > (1.0 if sure else DOUBT) * self.asked and self.pending:
             size, part = self.pilots.cell_size(), float(np.sqrt(ROOM * self.asked / mesh))
             raise AccuracyError(
                 f"A relative error of {self.asked:g} is asked for, but the mesh's own is about "
@@ -357,6 +361,8 @@ class Accurate:
                     self._verify(moment)
                 else:
                     self._decide(moment)
+            elif run.time > self.until * (1 - 1e-9):
+                self._see(moment)
         finally:
             self.spent += clock.process_time() - begun
 
@@ -364,6 +370,7 @@ class Accurate:
         """Halve the steps of the run's own method in a window; collective."""
         self.pending.pop(0)
         piece, exact = self._pair(self.method, begin)
+        self._see(piece.ends[1])
         self.found.time.append(self._amplitudes(begin, piece.ends, exact))
         self._mesh(self.method, begin, piece)
         budget, error = self._budget(), self._error(self.found.time)

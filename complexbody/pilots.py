@@ -4,12 +4,13 @@ r"""Pilot runs: short pieces of a scene's own motion, and how far two of them en
 A *window* begins at a state of the motion, with all histories shifted to its time. In it the states
 of two runs part by (d, s), of fields and rates. A field's *amplitude* of parting
 
-.. math:: a = \sqrt{|d|^2 + (r\,|s|)^2}, \qquad
+.. math:: a = \sqrt{|d|^2 + \tfrac12 (r\,|s|)^2}, \qquad
           r^2 = \min\Bigl(\frac{s\cdot Ms}{s\cdot Ks}, \Bigl(\frac{s\cdot Ms}{s\cdot Ds}\Bigr)^2\Bigr)
 
 (L2 norms; r is how far a unit rate moves the field: an oscillation's 1/ω, or what viscosity lets
 through) grows by the first power of time while phases drift apart, also in windows much shorter than
-a period, where d alone grows by the second.
+a period, where d alone grows by the second. (There s follows the state, not the rates, in and out of
+phase with it, of which only the former lasts: hence ½.)
 
 *The mesh.* P1 with masses half-way between lumped and consistent has no leading error of dispersion
 in one dimension. A motion with accelerations q̈ and rates q̇ would feel the forces
@@ -203,9 +204,10 @@ class Pilots:
             out[i] = min(ways, default=0.0)
         return out
 
-    def amplitude(self, moment: Moment, reach: Array) -> Array:
-        """√(|d|² + (r|s|)²) of u and ν (2,)."""
-        return np.sqrt(self._parts(moment.fields) + reach**2 * self._parts(moment.rates))
+    def amplitude(self, moment: Moment, reach: Array, weight: float = 1.0) -> Array:
+        """√(|d|² + weight (r|s|)²) of u and ν (2,)."""
+        rates = weight * reach**2 * self._parts(moment.rates)
+        return np.sqrt(self._parts(moment.fields) + rates)
 
     def floored(self, scale: Array) -> Array:
         """Norms of u and ν, neither below a twentieth of the other by √mass: it may yet grow."""
