@@ -2,39 +2,37 @@
 r"""The cheapest integrator and step that meet an accuracy, found by short runs on the scene itself.
 
 The *norm* is that of the charts: the larger of the relative L2 errors of u and ν at the end, over
-the largest norm of either in the run. At a few moments of the motion windows of it are run, of about
-a hundredth of the whole (:mod:`complexbody.pilots`): by each method that may be worth it, at its
-stable limit, against Richardson's extrapolation of two steps of the first of them; and with the
-forces that masses without the mesh's leading error would feel. Amplitudes of parting grow as a power
-p of time, 0 ≤ p ≤ 1, seen from the windows' middles to their ends (1 where phases drift apart, 0 for
-the ripple of cells that act alone), and as the square of the step. So
+the largest norm of either in the run. At a few moments of the motion windows of about a hundredth
+of it are run (:mod:`complexbody.pilots`): by each method that may be worth it, at its stable
+limit, against Richardson's extrapolation of two steps of the first of them; and with the forces
+that masses without the mesh's leading error would feel. The amplitudes a by which runs part in a
+window grow as a power p of time, 0 ≤ p ≤ 1, seen from the windows' middles to their ends (1 where
+phases drift apart, 0 for the ripple of cells that act alone), and as the square of the step. So
 
-.. math:: e = \langle a(w)\rangle\,(T/w)^p / \text{largest norm}.
+.. math:: e = (T/w)^p\,\Bigl\langle a_i \min\Bigl(1, \frac{q_{now}}{q_i}\Bigr)\Bigr\rangle / q_{most},
 
-The first window decides, before the run where something moves from the start. Two more, at states of
-the run itself, verify it by halving its steps: the run begins anew if the request would be missed.
+q the amplitude of the motion itself: what viscosity takes from it it takes from its errors as well.
+This is what the error may be at any phase near the end. The first window decides, before the run
+where something moves from the start. One or two more, at states of the run itself, verify it by
+halving its steps: the run begins anew if the request would be missed.
 """
 
 from __future__ import annotations
 
 import time as clock
 import warnings
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from complexbody.candidates import candidates, halved, name_of, scaled
 from complexbody.errors import AccuracyError
 from complexbody.histories import Constant
-from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
-from complexbody.integrators.implicit import Implicit
-from complexbody.integrators.local_leapfrog import LocalLeapfrog
-from complexbody.integrators.synchronous import Synchronous
 from complexbody.pilots import Moment, Piece, Pilots, attempt, moment_of
-from complexbody.planning import EVENT
 from complexbody.precheck import limits
 from complexbody.problem import Problem
 from complexbody.result import Result
@@ -44,25 +42,19 @@ from complexbody.simulate import Simulation, require_until
 Array = npt.NDArray[np.float64]
 
 #: A window is this part of the motion, and at least so many of the largest cell's critical steps.
-PART, STEPS = 120, 5.4
+PART, STEPS = 120, 3.6
 #: Where windows begin, as parts of the motion; the first one later if nothing moves at its start.
 WINDOWS, LATE = (0.0, 0.4, 0.7), 0.15
 #: Time may take this share of what the mesh leaves of the request, and at least that of all of it.
 SHARE, LEAST = 0.6, 0.15
-#: Methods are tried whose expected cost is at most so many times the least …
-DEAR = 3.0
-#: … those with local steps only if these would save so much at best.
-GAIN = 1.5
-#: Updates of local steps over those of each cell's own critical step, as experience has them.
-ROUNDED = {"LocalLeapfrog": 1.5, "AVI": 1.4}
-#: Times of an event of plain windows over a synchronous update (2D, 3D), as docs/claims.md has them.
-PLAIN = (1.1, 1.2)
 #: Processor time is believed where windows took so long [s]; else updates are counted.
 GRAIN = 0.02
 #: A run under way goes on with what would cost at most so many times the least.
 KEEP = 1.5
 #: One window alone refuses where the mesh's error seems to be so many times what is asked.
 DOUBT = 1.5
+#: Below this share of the request one window of the run is enough.
+CLEAR = 0.5
 #: Share of the request that the advised mesh leaves to its own error.
 ROOM = 0.7
 #: Loads act from where they reach this part of their largest factor.
@@ -110,16 +102,23 @@ class Accuracy:
         )
 
 
-class _Again(Exception):  # noqa: N818 - no error: the run begins anew
+class _Again(Exception):
     """The run would miss the request."""
 
 
-@dataclass
-class _Found:
-    """Amplitudes of parting at windows' middles and ends, (2,) each: of time, and of the mesh."""
+@dataclass(frozen=True)
+class _Parting:
+    """Amplitudes of u and ν (2,) by which two runs part at a window's middle and end.
 
-    time: list[tuple[Array, Array]] = field(default_factory=list)
-    mesh: list[tuple[Array, Array]] = field(default_factory=list)
+    ``own`` are those of the motion itself there.
+    """
+
+    middle: Array
+    end: Array
+    own: Array
+
+    def __mul__(self, factor: float) -> _Parting:
+        return _Parting(self.middle * factor, self.end * factor, self.own)
 
 
 class Accurate:
@@ -170,16 +169,17 @@ class Accurate:
 
     def _prepare(self) -> None:
         pilots, problem = self.pilots, self.pilots.problem
-        self.scale, self._own, self._most = (np.zeros(2) for _ in range(3))
-        self.found, self.work = _Found(), 0
+        self._own, self._most = (np.zeros(2) for _ in range(2))
+        self._time: list[_Parting] = []
+        self._space: list[_Parting] = []
+        self.work = 0
         self.factor, self.predicted, self.restarts = 1.0, np.nan, 0
         self.tried: dict[str, float] = {}
         self._chosen = self._running = False
         self.begin, moving = self._onset()
         self.length = self.until - self.begin
         found = limits(problem, "exact")
-        gain = found.uniform / found.local if found.local > 0 else 1.0
-        self.candidates = self._candidates(gain)
+        self.candidates = candidates(problem, found)
         self.method = self.candidates[0][0]
         longest = found.largest if self.method.asynchronous else found.smallest
         shortest = STEPS * longest if np.isfinite(longest) else 0.0
@@ -209,23 +209,6 @@ class Accurate:
         first = float(self.comm.allreduce(first, op=MPI.MIN))
         return (0.0, True) if moving or first >= 0.9 * self.until else (first, False)
 
-    def _candidates(self, gain: float) -> list[tuple[Any, float]]:
-        """Methods with their cost per update, the one expected to be the cheapest first."""
-        three = self.scene.mesh.geometry.dim > 2
-        if self.pilots.problem.convexity is not None:
-            return [(Implicit(), 1.0)]
-        out = [(Synchronous(), 1.0, 1 / 0.9)]
-        if gain >= GAIN:
-            local, avi = EVENT["LocalLeapfrog()"][three], EVENT["AVI()"][three]
-            out += [
-                (LocalLeapfrog(), local, ROUNDED["LocalLeapfrog"] / gain / 0.9),
-                (AVI(), avi, ROUNDED["AVI"] / gain / 0.45),
-                (AVI(balanced=False), PLAIN[three], ROUNDED["AVI"] / gain / 0.45),
-            ]
-        out.sort(key=lambda entry: entry[1] * entry[2])
-        least = out[0][1] * out[0][2]
-        return [(m, price) for m, price, updates in out if price * updates <= DEAR * least]
-
     # --- windows -------------------------------------------------------------------------------
 
     def _piece(self, method: Any, begin: Moment, extra: Array | None = None) -> Piece:
@@ -236,7 +219,7 @@ class Accurate:
     def _pair(self, method: Any, begin: Moment) -> tuple[Piece, list[Moment]]:
         """A run through a window, and its extrapolation with one of half the steps."""
         coarse = self._piece(method, begin)
-        fine = self._piece(_halved(method, 0.5 * self.window / coarse.steps), begin)
+        fine = self._piece(halved(method, 0.5 * self.window / coarse.steps), begin)
         # Of second order in steps whose ratio is that of their numbers.
         share = 1.0 / ((fine.steps / coarse.steps) ** 2 - 1.0)
         ends = [f + (f - c) * share for f, c in zip(fine.ends, coarse.ends, strict=True)]
@@ -246,35 +229,32 @@ class Accurate:
         """How the motion would part from one with masses of no leading error."""
         extra = self.pilots.defect(begin, piece.ends[1])
         other = self._piece(method, begin, extra)
-        self.found.mesh.append(self._amplitudes(begin, piece.ends, other.ends))
+        self._space.append(self._parting(begin, piece.ends, other.ends))
 
-    def _amplitudes(
-        self, begin: Moment, ends: Any, exact: Any, reach: Array | None = None
-    ) -> tuple[Array, Array]:
+    def _parting(self, begin: Moment, ends: Any, exact: Any) -> _Parting:
         middle, end = (e - x for e, x in zip(ends, exact, strict=True))
-        if reach is None:
-            reach = self.pilots.reach(begin, end)
-        parts = (self.pilots.amplitude(m, reach, 0.5) for m in (middle, end))
-        own = self.pilots.floored(self._own)
-        middle, end = (np.where(own > 0, p / np.where(own > 0, own, 1.0), 0.0) for p in parts)
-        return middle, end
+        reach = self.pilots.reach(begin, end)
+        parts = [self.pilots.amplitude(m, reach, 0.5) for m in (middle, end)]
+        return _Parting(parts[0], parts[1], self._own)
 
     def _see(self, moment: Moment) -> None:
         """Know the amplitudes of the motion itself at a state: what its rates make of it, too."""
         self._own = self.pilots.amplitude(moment, self.pilots.reach(moment, moment))
         self._most = np.maximum(self._most, self._own)
 
-    def _error(self, parts: list[tuple[Array, Array]]) -> float:
-        """Relative error at the end from amplitudes in windows."""
+    def _error(self, parts: list[_Parting]) -> float:
+        """Relative error at the end from windows."""
         if not parts:
             return 0.0
-        middle, end = (np.mean([p[i] for p in parts], axis=0) for i in (0, 1))
         with np.errstate(all="ignore"):
-            power = np.clip(np.nan_to_num(np.log2(end / middle), nan=1.0), 0.0, 1.0)
-            relative = end * (self.length / self.window) ** power
             # What viscosity takes from the motion it takes from its errors as well.
-            relative = relative * self._own / self._most
-        return float(np.max(np.where(np.isnan(relative), 0.0, relative)))
+            left = [np.nan_to_num(np.minimum(1.0, self._own / p.own), nan=1.0) for p in parts]
+            pairs = list(zip(parts, left, strict=True))
+            middle = np.mean([p.middle * part for p, part in pairs], axis=0)
+            end = np.mean([p.end * part for p, part in pairs], axis=0)
+            power = np.clip(np.nan_to_num(np.log2(end / middle), nan=1.0), 0.0, 1.0)
+            error = end * (self.length / self.window) ** power / self.pilots.floored(self._most)
+        return float(np.max(np.where(np.isnan(error), 0.0, error)))
 
     def _decide(self, begin: Moment) -> None:
         """Choose by the first window; collective.
@@ -296,13 +276,13 @@ class Accurate:
         timed = all(made.measured > GRAIN for *_, made in pieces)
         rows = []
         for method, cost, made in pieces:
-            parts = self._amplitudes(begin, made.ends, exact)
+            parts = self._parting(begin, made.ends, exact)
             error = self._error([parts])
             factor = min(1.0, float(np.sqrt(budget / error))) if error > 0 else 1.0
             spent = (made.seconds if timed else made.updates * cost) / factor
             rows.append((spent, method, factor, 0.5 * self.window / made.steps, parts))
         best = min(rows, key=lambda row: row[0])
-        self.tried = {_name(row[1]): row[0] / best[0] for row in rows}
+        self.tried = {name_of(row[1]): row[0] / best[0] for row in rows}
         self._chosen = True
         if self._running:
             # The run is under way with the first of them: good enough goes on.
@@ -313,21 +293,16 @@ class Accurate:
                 raise _Again
         self._take(*best[1:])
 
-    def _take(self, method: Any, factor: float, step: float, parts: tuple[Array, Array]) -> None:
+    def _take(self, method: Any, factor: float, step: float, parts: _Parting) -> None:
         """Use a method at this factor of its limit, where it makes ``step`` and parts so far."""
         self._limit, self._step, self._parts = method, step, parts
         self._set(factor)
-        self.predicted = self._error(self.found.time)
+        self.predicted = self._error(self._time)
 
     def _set(self, factor: float) -> None:
         self.factor = factor
-        self.found.time = [(self._parts[0] * factor**2, self._parts[1] * factor**2)]
-        self.method = method = self._limit
-        if isinstance(method, Implicit):
-            step = self.until / np.ceil(self.until / (factor * self._step) * (1 - 1e-12))
-            self.method = replace(method, step=float(step))
-        elif factor < 1:
-            self.method = replace(method, safety=factor * method.safety)
+        self._time = [self._parts * factor**2]
+        self.method = scaled(self._limit, factor, self._step, self.until)
 
     def _budget(self) -> float:
         """What is left for time; collective.
@@ -335,8 +310,8 @@ class Accurate:
         Raises:
             AccuracyError: if the mesh leaves nothing.
         """
-        mesh = self._error(self.found.mesh)
-        sure = len(self.found.mesh) > 1
+        mesh = self._error(self._space)
+        sure = len(self._space) > 1
         if mesh > (1.0 if sure else DOUBT) * self.asked and self.pending:
             size, part = self.pilots.cell_size(), float(np.sqrt(ROOM * self.asked / mesh))
             raise AccuracyError(
@@ -354,7 +329,7 @@ class Accurate:
         """
         begun = clock.process_time()
         moment = moment_of(run, problem)
-        self.scale = np.maximum(self.scale, self.pilots.norms(moment))
+        self._most = np.maximum(self._most, self.pilots.norms(moment))
         try:
             if self.pending and run.time >= self.pending[0] * (1 - 1e-9):
                 if self._chosen:
@@ -371,12 +346,14 @@ class Accurate:
         self.pending.pop(0)
         piece, exact = self._pair(self.method, begin)
         self._see(piece.ends[1])
-        self.found.time.append(self._amplitudes(begin, piece.ends, exact))
+        self._time.append(self._parting(begin, piece.ends, exact))
         self._mesh(self.method, begin, piece)
-        budget, error = self._budget(), self._error(self.found.time)
+        budget, error = self._budget(), self._error(self._time)
         if error > budget / SHARE and self.pending and self.restarts == 0:
             self._set(0.9 * self.factor * float(np.sqrt(budget / error)))
             raise _Again
+        if error + self._error(self._space) < CLEAR * self.asked:
+            self.pending.clear()
 
     # --- the run -------------------------------------------------------------------------------
 
@@ -404,7 +381,7 @@ class Accurate:
         return result
 
     def _record(self, result: Result) -> Accuracy:
-        verified, mesh = self._error(self.found.time), self._error(self.found.mesh)
+        verified, mesh = self._error(self._time), self._error(self._space)
         spent = float(self.comm.allreduce(self.spent, op=MPI.MAX))
         made = Accuracy(
             self.asked, "fields", self.method, self.factor, self.predicted, verified, mesh,
@@ -418,17 +395,3 @@ class Accurate:
                 UserWarning, stacklevel=3,
             )  # fmt: skip
         return made
-
-
-def _halved(method: Any, step: float) -> Any:
-    """A method whose every step is half of what it was, with ``step`` [s] all together."""
-    if isinstance(method, AVI):
-        return replace(method, safety=0.5 * method.safety)
-    if isinstance(method, LocalLeapfrog):
-        return replace(method, safety=0.5 * method.safety, step=0.5 * step)
-    return replace(method, step=0.5 * step)
-
-
-def _name(method: Any) -> str:
-    plain = isinstance(method, AVI) and not method.balanced
-    return type(method).__name__ + (" plain" if plain else "")

@@ -4,13 +4,13 @@ r"""Pilot runs: short pieces of a scene's own motion, and how far two of them en
 A *window* begins at a state of the motion, with all histories shifted to its time. In it the states
 of two runs part by (d, s), of fields and rates. A field's *amplitude* of parting
 
-.. math:: a = \sqrt{|d|^2 + \tfrac12 (r\,|s|)^2}, \qquad
-          r^2 = \min\Bigl(\frac{s\cdot Ms}{s\cdot Ks}, \Bigl(\frac{s\cdot Ms}{s\cdot Ds}\Bigr)^2\Bigr)
+.. math:: a^2 = |d|^2 + \tfrac12 r^2 |s|^2, \qquad
+          r = \min\Bigl(\sqrt{\frac{s\cdot Ms}{s\cdot Ks}}, \frac{s\cdot Ms}{s\cdot Ds}\Bigr)
 
 (L2 norms; r is how far a unit rate moves the field: an oscillation's 1/ω, or what viscosity lets
-through) grows by the first power of time while phases drift apart, also in windows much shorter than
-a period, where d alone grows by the second. (There s follows the state, not the rates, in and out of
-phase with it, of which only the former lasts: hence ½.)
+through) grows by the first power of time while phases drift apart, also in windows much shorter
+than a period, where d alone grows by the second. There s is in phase with the motion and out of
+phase by turns; only one of them lasts: hence ½.
 
 *The mesh.* P1 with masses half-way between lumped and consistent has no leading error of dispersion
 in one dimension. A motion with accelerations q̈ and rates q̇ would feel the forces
@@ -99,31 +99,23 @@ class Pilots:
         plan: Leave out components that stay zero, as the run itself does.
 
     Attributes:
-        problem: Its problem, whose components are those of states.
-        spent: Processor time of all that was done here, of the slowest rank [s].
+        problem: Its problem, whose components are those of states; start: the initial one.
     """
 
     def __init__(self, scene: Scene, plan: bool = True) -> None:
-        begun = clock.process_time()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the run itself will tell them
             self.problem = Problem(scene, reduce=plan)
         self.comm, self._loads = self.problem.comm, self.problem.loads
         self.n_u = self.problem.scene.displacement
         masses, disc = self.problem.masses, self.problem.disc
+        start = np.zeros((2, len(self.problem.scene.mesh.geometry.x), disc.n))
+        start[:, disc.dof] = self.problem.initial_fields, self.problem.initial_rates
+        self.start = Moment(start[0], start[1], 0.0)
         weight = disc.volume * disc.owned
         node = masses.full(masses.inertia, masses.density)[masses.classes[:-1]]
         mass = np.einsum("a,aii->i", weight, node)
         self._mean_mass = self.comm.allreduce(mass) / self.comm.allreduce(float(weight.sum()))
-        self.spent = clock.process_time() - begun
-
-    @property
-    def start(self) -> Moment:
-        """The scene's initial state."""
-        disc = self.problem.disc
-        out = np.zeros((2, len(self.problem.scene.mesh.geometry.x), disc.n))
-        out[:, disc.dof] = self.problem.initial_fields, self.problem.initial_rates
-        return Moment(out[0], out[1], 0.0)
 
     def run(self, method: Any, begin: Moment, length: float, extra: Array | None = None) -> Piece:
         """Run through a window; collective.

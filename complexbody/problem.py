@@ -204,7 +204,8 @@ class Problem:
         """Let the next runs begin with another state, at the time ``t`` of the scene's histories.
 
         Args:
-            fields, rates: Of this rank's geometry nodes, shape (geometry nodes, n).
+            fields: (u, ν) of this rank's geometry nodes, shape (geometry nodes, n).
+            rates: Of the same.
             t: Time [s], from which runs count theirs; runs already made are of no more use.
         """
         self.start = fields, rates
