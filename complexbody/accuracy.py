@@ -9,9 +9,9 @@ that masses without the mesh's leading error would feel. The amplitudes a by whi
 window grow as a power p of time, 0 ≤ p ≤ 1, seen from the windows' middles to their ends (1 where
 phases drift apart, 0 for the ripple of cells that act alone), and as the square of the step. So
 
-.. math:: e = (T/w)^p\,\Bigl\langle a_i \min\Bigl(1, \frac{q_{now}}{q_i}\Bigr)\Bigr\rangle / q_{most},
+.. math:: e = (T/w)^p\,\bigl\langle a_i \min(1, q_{now}/q_i)\bigr\rangle / q_{most},
 
-q the amplitude of the motion itself: what viscosity takes from it it takes from its errors as well.
+q the amplitude of the motion itself: what viscosity takes from it, it takes from its errors, too.
 This is what the error may be at any phase near the end. The first window decides, before the run
 where something moves from the start. One or two more, at states of the run itself, verify it by
 halving its steps: the run begins anew if the request would be missed.

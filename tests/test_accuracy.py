@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""A relative error that is asked for: met, verified, or refused with the mesh that could meet it."""
+"""A relative error asked for: met, verified, or refused with the mesh that could meet it."""
 
 import dataclasses
 import json
@@ -186,9 +186,7 @@ def test_a_run_begins_anew(comm, monkeypatch):
 
     def decide(self, begin):
         hopeful(self, begin)
-        self.factor = 1.0
-        self.method = self._limit
-        self.found.time = [self._parts]
+        self._set(1.0)
 
     monkeypatch.setattr(accuracy.Accurate, "_decide", decide)
     result = cb.simulate(bar(comm, 120), until=2.3, accuracy=1e-3)
@@ -218,7 +216,7 @@ def test_refusals(comm):
         cb.simulate(scene, until=-1.0, accuracy=1e-2)
 
 
-# --- pilots ----------------------------------------------------------------------------------------
+# --- pilots --------------------------------------------------------------------------------------
 
 
 def test_shifted_histories():
@@ -295,7 +293,7 @@ def test_halved_steps():
     assert halved(cb.Synchronous(), 0.5).step == 0.25
 
 
-# --- the command line ------------------------------------------------------------------------------
+# --- the command line ----------------------------------------------------------------------------
 
 
 SCENE = """
