@@ -9,9 +9,10 @@ that masses without the mesh's leading error would feel. The amplitudes a by whi
 window grow as a power p of time, 0 ≤ p ≤ 1, seen from the windows' middles to their ends (1 where
 phases drift apart, 0 for the ripple of cells that act alone), and as the square of the step. So
 
-.. math:: e = (T/w)^p\,\bigl\langle a_i \min(1, q_{now}/q_i)\bigr\rangle / q_{most},
+.. math:: e = \bar r\,(T/w)^p\,\langle\min(q, q_T)\rangle / q_{most},
 
-q the amplitude of the motion itself: what viscosity takes from it, it takes from its errors, too.
+r the mean of a/q over windows and q the amplitude of the motion itself: what moves later errs for a
+shorter time, and what viscosity takes from the motion it takes from its errors, too.
 This is what the error may be at any phase near the end. The first window decides, before the run
 where something moves from the start. One or two more, at states of the run itself, verify it by
 halving its steps: the run begins anew if the request would be missed.
@@ -169,7 +170,8 @@ class Accurate:
 
     def _prepare(self) -> None:
         pilots, problem = self.pilots, self.pilots.problem
-        self._own, self._most = (np.zeros(2) for _ in range(2))
+        self._own, self._reach = (np.zeros(2) for _ in range(2))
+        self._history: list[tuple[float, Array]] = []
         self._time: list[_Parting] = []
         self._space: list[_Parting] = []
         self.work = 0
@@ -237,10 +239,21 @@ class Accurate:
         parts = [self.pilots.amplitude(m, reach, 0.5) for m in (middle, end)]
         return _Parting(parts[0], parts[1], self._own)
 
-    def _see(self, moment: Moment) -> None:
-        """Know the amplitudes of the motion itself at a state: what its rates make of it, too."""
-        self._own = self.pilots.amplitude(moment, self.pilots.reach(moment, moment))
-        self._most = np.maximum(self._most, self._own)
+    def _see(self, moment: Moment, anew: bool = True) -> None:
+        """Know the amplitudes of the motion itself; ``anew``: also how far its rates reach."""
+        if anew:
+            self._reach = self.pilots.reach(moment, moment)
+        self._own = self.pilots.amplitude(moment, self._reach)
+        self._history.append((moment.time, self._own))
+
+    def _lasting(self) -> Array:
+        """Mean of min(q, q_now) over the largest q, u and ν (2,); the future as it is now."""
+        times = np.array([self.begin, *(t for t, _ in self._history)])
+        least = np.array([np.minimum(q, self._own) for _, q in self._history])
+        past = np.sum(np.diff(times)[:, None] * least, axis=0)
+        mean = (past + (self.begin + self.length - times[-1]) * self._own) / self.length
+        most = np.max([q for _, q in self._history], axis=0)
+        return np.asarray(mean / self.pilots.floored(most))
 
     def _error(self, parts: list[_Parting]) -> float:
         """Relative error at the end from windows."""
@@ -250,10 +263,11 @@ class Accurate:
             # What viscosity takes from the motion it takes from its errors as well.
             left = [np.nan_to_num(np.minimum(1.0, self._own / p.own), nan=1.0) for p in parts]
             pairs = list(zip(parts, left, strict=True))
-            middle = np.mean([p.middle * part for p, part in pairs], axis=0)
-            end = np.mean([p.end * part for p, part in pairs], axis=0)
+            middle = np.sum([p.middle * part for p, part in pairs], axis=0)
+            end = np.sum([p.end * part for p, part in pairs], axis=0)
+            own = np.sum([self.pilots.floored(p.own) * part for p, part in pairs], axis=0)
             power = np.clip(np.nan_to_num(np.log2(end / middle), nan=1.0), 0.0, 1.0)
-            error = end * (self.length / self.window) ** power / self.pilots.floored(self._most)
+            error = end / own * (self.length / self.window) ** power * self._lasting()
         return float(np.max(np.where(np.isnan(error), 0.0, error)))
 
     def _decide(self, begin: Moment) -> None:
@@ -285,9 +299,10 @@ class Accurate:
         self.tried = {name_of(row[1]): row[0] / best[0] for row in rows}
         self._chosen = True
         if self._running:
-            # The run is under way with the first of them: good enough goes on.
-            if rows[0][2] == 1.0 and rows[0][0] <= KEEP * best[0]:
-                best = rows[0]
+            # The run is under way with the first of them: what is good enough goes on.
+            spent, method, factor, step, parts = rows[0]
+            if factor**2 >= SHARE and factor * spent <= KEEP * best[0]:
+                best = factor * spent, method, 1.0, step, parts
             else:
                 self._take(*best[1:])
                 raise _Again
@@ -329,15 +344,14 @@ class Accurate:
         """
         begun = clock.process_time()
         moment = moment_of(run, problem)
-        self._most = np.maximum(self._most, self.pilots.norms(moment))
         try:
             if self.pending and run.time >= self.pending[0] * (1 - 1e-9):
                 if self._chosen:
                     self._verify(moment)
                 else:
                     self._decide(moment)
-            elif run.time > self.until * (1 - 1e-9):
-                self._see(moment)
+            elif run.time >= self.begin:
+                self._see(moment, anew=run.time > self.until * (1 - 1e-9))
         finally:
             self.spent += clock.process_time() - begun
 
@@ -371,6 +385,7 @@ class Accurate:
                     break
                 except _Again:
                     self.restarts += 1
+                    self._history.clear()
                     self.pending = [self.begin + part * self.length for part in WINDOWS[1:]]
                     self.simulation = Simulation(
                         self.scene, self.method, until=self.until, watch=self, **self.options
