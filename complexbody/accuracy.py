@@ -219,19 +219,20 @@ class Accurate:
         return made
 
     def _pair(self, method: Any, begin: Moment) -> tuple[Piece, list[Moment]]:
-        """A run through a window, and its extrapolation with one of half the steps."""
+        """A run through a window, and its extrapolation with one of half the steps.
+
+        Between them, how it would part from a motion with masses of no leading error.
+        """
         coarse = self._piece(method, begin)
+        self._see(coarse.ends[1])
+        extra = self.pilots.defect(begin, coarse.ends[1])
+        other = self._piece(method, begin, extra)
+        self._space.append(self._parting(begin, coarse.ends, other.ends))
         fine = self._piece(halved(method, 0.5 * self.window / coarse.steps), begin)
         # Of second order in steps whose ratio is that of their numbers.
         share = 1.0 / ((fine.steps / coarse.steps) ** 2 - 1.0)
         ends = [f + (f - c) * share for f, c in zip(fine.ends, coarse.ends, strict=True)]
         return coarse, ends
-
-    def _mesh(self, method: Any, begin: Moment, piece: Piece) -> None:
-        """How the motion would part from one with masses of no leading error."""
-        extra = self.pilots.defect(begin, piece.ends[1])
-        other = self._piece(method, begin, extra)
-        self._space.append(self._parting(begin, piece.ends, other.ends))
 
     def _parting(self, begin: Moment, ends: Any, exact: Any) -> _Parting:
         middle, end = (e - x for e, x in zip(ends, exact, strict=True))
@@ -279,8 +280,6 @@ class Accurate:
         self.pending.pop(0)
         first, price = self.candidates[0]
         piece, exact = self._pair(first, begin)
-        self._see(piece.ends[1])
-        self._mesh(first, begin, piece)
         budget = self._budget()
         pieces = [(first, price, piece)]
         for method, cost in self.candidates[1:]:
@@ -359,9 +358,7 @@ class Accurate:
         """Halve the steps of the run's own method in a window; collective."""
         self.pending.pop(0)
         piece, exact = self._pair(self.method, begin)
-        self._see(piece.ends[1])
         self._time.append(self._parting(begin, piece.ends, exact))
-        self._mesh(self.method, begin, piece)
         budget, error = self._budget(), self._error(self._time)
         if error > budget / SHARE and self.pending and self.restarts == 0:
             self._set(0.9 * self.factor * float(np.sqrt(budget / error)))

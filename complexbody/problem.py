@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 
 from complexbody import _compat, boundary, hessian, native
 from complexbody.action import Action
@@ -54,6 +55,7 @@ class Problem:
             the lower bound γI in its place.
         convexity, kinetic_range: Of general χ: how γ, Ξ and T₀ are measured (None if there is no
             such χ), and what they are at the initial state.
+        known_steps: Critical steps of owned cells by dissipation scheme, as far as computed [s].
         warnings: What A1 leaves to the boundary data, in words.
 
     Raises:
@@ -74,6 +76,7 @@ class Problem:
         self.start = boundary.initial(scene, self.action)
         self._read_inertia()
         self.node_step: float | Array = 0.0
+        self.known_steps: dict[str, Array] = {}
         self.arrange()
         self.warnings = self._check_energy()
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
@@ -103,7 +106,7 @@ class Problem:
         """Give up what only steps and stiffnesses of all components needed; collective."""
         if self.full is not self:
             self.full.close()
-            self.full = self
+            self.full, self.known_steps = self, {}
 
     def spread(self, values: Array) -> Array:
         """Values of the scene's components (…, n) among zeros for those left out (…, n_u + k)."""
@@ -146,16 +149,19 @@ class Problem:
     def arrange(self, group: npt.NDArray[np.int64] | None = None) -> None:
         """Lay out cells and nodes (anew), cells of one block being of one group; collective.
 
+        What is laid out so already stays.
+
         Args:
             group: A whole number per owned cell, or None for one group.
         """
-        scene = self.scene
-        if hasattr(self, "disc"):
-            self.disc.halo.close()
-        moving = self.supports.moving
-        self.disc = Discretisation(scene, np.flatnonzero(moving.any(axis=1)), group)
+        scene, moving = self.scene, self.supports.moving
+        if not self._laid_out(group):
+            if hasattr(self, "disc"):
+                self.disc.halo.close()
+            self.disc = Discretisation(scene, np.flatnonzero(moving.any(axis=1)), group)
+            self.kernels = Kernels(self.action, self.disc)
+            self._group = None if group is None else np.array(group)
         disc = self.disc
-        self.kernels = Kernels(self.action, disc)
         fixed = self.supports.fixed[disc.dof]
         if not hasattr(self, "self_stiffness"):
             self.self_stiffness = np.zeros((len(scene.bodies), scene.descriptor, scene.descriptor))
@@ -200,6 +206,14 @@ class Problem:
         v0[rows, columns] = 0.0
         self.initial_fields, self.initial_rates = x0, v0
 
+    def _laid_out(self, group: npt.NDArray[np.int64] | None) -> bool:
+        """Whether cells are in these groups already, on all ranks; collective."""
+        if not hasattr(self, "disc"):
+            return False
+        if group is None or self._group is None:
+            return group is None and self._group is None
+        return bool(self.comm.allreduce(np.array_equal(group, self._group), op=MPI.LAND))
+
     def restart(self, fields: Array, rates: Array, t: float) -> None:
         """Let the next runs begin with another state, at the time ``t`` of the scene's histories.
 
@@ -209,6 +223,8 @@ class Problem:
             t: Time [s], from which runs count theirs; runs already made are of no more use.
         """
         self.start = fields, rates
+        if not self.kernels.densities.linear:
+            self.known_steps = {}
         for histories in (self.loads.histories, self.supports.histories):
             histories[:] = [shifted(history, t) for history in histories]
         self._lay_loads()
