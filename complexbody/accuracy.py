@@ -52,8 +52,9 @@ SHARE, LEAST = 0.6, 0.15
 GRAIN = 0.02
 #: A run under way goes on with what would cost at most so many times the least.
 KEEP = 1.5
-#: One window alone refuses where the mesh's error seems to be so many times what is asked.
-DOUBT = 1.5
+#: By so much estimates may be too large at the first, second, … window: where something moves from
+#: the start, and where motion sets in later, whose onset has the shortest waves.
+DOUBT, DOUBT_LATE = (1.5, 1.0), (8.0, 2.0, 1.0)
 #: Below this share of the request one window of the run is enough.
 CLEAR = 0.5
 #: Share of the request that the advised mesh leaves to its own error.
@@ -179,6 +180,7 @@ class Accurate:
         self.tried: dict[str, float] = {}
         self._chosen = self._running = False
         self.begin, moving = self._onset()
+        self._late = not moving
         self.length = self.until - self.begin
         found = limits(problem, "exact")
         self.candidates = candidates(problem, found)
@@ -325,15 +327,17 @@ class Accurate:
             AccuracyError: if the mesh leaves nothing.
         """
         mesh = self._error(self._space)
-        sure = len(self._space) > 1
-        if mesh > (1.0 if sure else DOUBT) * self.asked and self.pending:
+        doubts = DOUBT_LATE if self._late else DOUBT
+        doubt = doubts[min(len(self._space), len(doubts)) - 1]
+        if mesh > doubt * self.asked and self.pending:
             size, part = self.pilots.cell_size(), float(np.sqrt(ROOM * self.asked / mesh))
             raise AccuracyError(
                 f"A relative error of {self.asked:g} is asked for, but the mesh's own is about "
                 f"{mesh:.2g}. Give cells {part:.2g} times as long (median {size * part:.3g} m in "
                 f"place of {size:.3g} m), or ask for {1.3 * mesh:.1g}."
             )
-        return max(SHARE * (self.asked - mesh), LEAST * self.asked)
+        surely = mesh / doubt if self._late else mesh
+        return max(SHARE * (self.asked - surely), LEAST * self.asked)
 
     def look(self, run: Run, problem: Problem) -> None:
         """Look at the run: norms, and windows where they are due; collective.

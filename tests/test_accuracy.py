@@ -166,7 +166,7 @@ def test_a_miss_is_told(comm, monkeypatch):
     """Windows that come too late to begin anew: a warning with the number."""
     from complexbody import accuracy
 
-    monkeypatch.setattr(accuracy, "DOUBT", 1e9)
+    monkeypatch.setattr(accuracy, "DOUBT", (1e9, 1e9))
     monkeypatch.setattr(accuracy, "WINDOWS", (0.0, 0.6))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
