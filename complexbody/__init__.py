@@ -21,6 +21,7 @@ from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
 from complexbody.simulate import simulate
+from complexbody.stability import stability
 from complexbody.workprecision import Chart, chart
 
 __version__ = "0.1.0"
@@ -53,6 +54,7 @@ __all__ = [
     "ricker",
     "simulate",
     "sine",
+    "stability",
     "step",
     "table",
 ]

@@ -46,7 +46,7 @@ class ChartFile:
     def __init__(
         self, comm: Any, folder: Path | None, identity: Mapping[str, Any], fresh: bool = False
     ) -> None:
-        self.comm, self.identity = comm, _plain(identity)
+        self.comm, self.identity = comm, comm.bcast(_plain(identity))
         self.path = None if folder is None else Path(folder) / "chart.json"
         self.rows: dict[str, dict[str, Any]] = {}
         self.references: dict[str, Any] = {}

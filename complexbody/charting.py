@@ -155,8 +155,6 @@ class _Panel:
 
     def _slopes(self) -> None:
         """How errors fall with cost by the orders of the schemes, in the lower left corner."""
-        from matplotlib.patheffects import withStroke
-
         axes, dim = self.axes, self.chart.head.get("dimension", 1)
         (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
         width, height = math.log10(right / left), math.log10(high / low)
@@ -170,10 +168,9 @@ class _Panel:
             end = start[0] * 10**run, start[1] * 10 ** (-slope * run)
             axes.plot(*zip(start, end, strict=True), ":", color="0.35", lw=1.3, scalex=False,
                       scaley=False)  # fmt: skip
-            axes.annotate(
-                " " + text, end, color="0.3", fontsize=8, va="center",
-                path_effects=[withStroke(linewidth=2.5, foreground="white")],
-            )  # fmt: skip
+            at = dict(xytext=(0, 4), textcoords="offset points") if self.kind == "total" else {}
+            place = start if self.kind == "total" else end
+            axes.annotate(" " + text, place, color="0.3", fontsize=8, va="center", zorder=0, **at)
         axes.set_xlim(left, right)
         axes.set_ylim(low, high)
 

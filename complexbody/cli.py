@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from mpi4py import MPI
 
-from complexbody import __version__, cli_chart, cli_plan, commands
+from complexbody import __version__, cli_chart, cli_plan, cli_stability, commands
 from complexbody.cli_texts import EPILOG, RUN_EPILOG
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
@@ -92,6 +92,7 @@ def parser() -> argparse.ArgumentParser:
     planned = command("plan", cli_plan.command, cli_plan.TEXT)
     _scene(planned)
     _integrator(planned)
+    cli_stability.declare(command)
     cli_chart.add(command, _scene)
     command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
     return main
@@ -110,7 +111,10 @@ def _scene(to: argparse.ArgumentParser) -> None:
 def _integrator(to: argparse.ArgumentParser) -> None:
     group = to.add_argument_group("integrator")
     names = tuple(commands.INTEGRATORS)
-    group.add_argument("--integrator", choices=names, help=f"default {names[0]}")
+    group.add_argument(
+        "--integrator", metavar="NAME", choices=names,
+        help=f"{', '.join(names[:-1])} or {names[-1]}; default {names[0]}",
+    )  # fmt: skip
     group.add_argument(
         "--step", metavar="H", type=float,
         help="step [s], of local-leapfrog the coarse one; default: safety times the critical step",
@@ -151,7 +155,11 @@ def _integrator(to: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     group.add_argument(
         "--order", type=int, choices=(1, 2),
-        help="implicit: midpoint (2, default) or the paper's scheme (1)",
+        help="implicit: midpoint (2, default), or the paper's scheme or backward Euler (1)",
+    )  # fmt: skip
+    group.add_argument(
+        "--forces", choices=("explicit", "implicit"),
+        help="implicit: those on ν explicit (default), or solved for at the step of u alone",
     )  # fmt: skip
     group.add_argument(
         "--quadrature", choices=("vertex", "consistent"),

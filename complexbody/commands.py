@@ -50,7 +50,7 @@ INTEGRATORS = {
 _OPTIONS = (
     "step", "safety", "dissipation", "start", "critical", "unstable_ok", "schedule", "balanced",
     "corrected", "stabilisation", "levels", "order", "quadrature", "tolerance", "iterations",
-    "monitor", "options", "force", "kind",
+    "monitor", "options", "force", "kind", "forces",
 )  # fmt: skip
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Reading a density symbolically: is it quadratic, what is its Hessian, is it coercive (A1)?
+"""Reading a density symbolically: is it quadratic, and what is its Hessian?
 
 A UFL density is evaluated over polynomials in the unknowns (∇u, ∇ν, u, ν) instead of numbers.
 What remains of degree two or less is the density exactly: no differentiation, no sampling.
@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from ufl import classes as uc
@@ -22,7 +21,6 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.algorithms.apply_derivatives import apply_derivatives
 
 from complexbody import _compat
-from complexbody.errors import CoercivityError
 
 #: Monomial (sorted indices of unknowns, at most two) -> coefficient (float or UFL scalar).
 Poly = dict[tuple[int, ...], Any]
@@ -226,65 +224,3 @@ def names(n_u: int, k: int) -> list[str]:
     gradients = [f"U{i + 1}{j + 1}" for i in range(n_u) for j in range(3)]
     gradients += [f"N{i + 1}{j + 1}" for i in range(k) for j in range(3)]
     return gradients + [f"u{i + 1}" for i in range(n_u)] + [f"nu{i + 1}" for i in range(k)]
-
-
-def check_coercive(
-    hessian: npt.NDArray[np.float64], n_u: int, k: int, dim: int, name: str
-) -> list[str]:
-    """Check A1 for Hessians of ρe: symmetric, finite, no negative eigenvalue on (sym U, ν, N).
-
-    Args:
-        hessian: H of ρe, shape (m, 4n, 4n), in the order of :class:`Quadratic`; m samples.
-        n_u: Components of u.
-        k: Components of ν.
-        dim: Dimension of the mesh: other columns of U and N do not exist.
-        name: The body's name, for messages.
-
-    Returns:
-        The null modes other than rigid rotations, in words: semidefinite directions, which the
-        boundary data must hold.
-
-    Raises:
-        CoercivityError: with the eigenvalue and the mode.
-    """
-    n, labels = n_u + k, names(n_u, k)
-    if not np.all(np.isfinite(hessian)):
-        raise CoercivityError(f"The energy of {name} has a Hessian that is not finite. Check it.")
-    keep = [3 * i + j for i in range(n) for j in range(dim)] + [3 * n + n_u + i for i in range(k)]
-    # A descriptor the energy does not see is held by its gradients, as u is by its own.
-    seen = np.abs(hessian).max(axis=(0, 2), initial=0.0) > 0
-    keep = [i for i in keep if i < 3 * n or seen[i]]
-    h = hessian[:, keep][:, :, keep]
-    # Units differ between U, N and ν: compare each with its own diagonal.
-    d = np.sqrt(np.abs(np.einsum("mii->mi", h)))
-    d = np.where(d > 0, d, d.max(axis=1, keepdims=True, initial=1e-150))  # its square is divided by
-    values, vectors = np.linalg.eigh(h / (d[:, :, None] * d[:, None, :]))
-    worst = int(np.argmin(values[:, 0]))
-    tolerance = 1e-11
-
-    def words(vector: npt.NDArray[np.float64], scale: npt.NDArray[np.float64]) -> str:
-        mode = vector / scale
-        mode = mode / mode[np.argmax(np.abs(mode))]
-        big = [i for i in np.argsort(-np.abs(mode)) if abs(mode[i]) > 0.05][:6]
-        return " ".join(f"{mode[i]:+.3g} {labels[keep[i]]}" for i in big)
-
-    if values[worst, 0] < -tolerance:
-        mode = vectors[worst, :, 0]
-        amount = float(mode / d[worst] @ h[worst] @ (mode / d[worst]))
-        raise CoercivityError(
-            f"The energy of {name} is not coercive (A1): along the mode {words(mode, d[worst])} it "
-            f"is negative (relative eigenvalue {values[worst, 0]:.3e}, g·Hg = {amount:.3e} J/m³). "
-            "Change the constants so that the coupling stays below the bound of the form."
-        )
-    # Rigid rotations (skw U) are the null modes that objectivity demands (Korn).
-    rotations = []
-    for i, j in itertools.combinations(range(min(n_u, dim)), 2):
-        r = np.zeros(len(labels))
-        r[3 * i + j], r[3 * j + i] = 1.0, -1.0
-        rotations.append(r[keep] * d[worst])
-    null = vectors[worst][:, values[worst] < tolerance]
-    if rotations:
-        q, _ = np.linalg.qr(np.array(rotations).T)
-        null = null - q @ (q.T @ null)
-    left, sizes, _ = np.linalg.svd(null, full_matrices=False) if null.size else (null, [], None)
-    return [words(left[:, i], d[worst]) for i, size in enumerate(sizes) if size > 1e-6]

@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody.histories import Constant
+from complexbody.instabilities import known_instabilities
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.invariance import AXES, invariant_axes
 from complexbody.precheck import Limits, limits
@@ -107,7 +108,12 @@ def plan(scene: Scene, until: float | None = None, integrator: Any = None) -> Pl
     found = limits(problem, getattr(method, "dissipation", "exact"))
     times = _scales(problem, found, until)
     made = Plan(
-        *_names(problem), (*_exact(problem, method), _steps(problem, found)), times,
+        *_names(problem),
+        (
+            *_exact(problem, method), _steps(problem, found),
+            *(Finding("unstable", t) for t in known_instabilities(problem, method, until)),
+        ),
+        times,
         tuple(_suggestions(problem, found, times, until)),
     )  # fmt: skip
     problem.close()

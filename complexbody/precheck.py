@@ -7,7 +7,6 @@ and a few timed steps.
 
 from __future__ import annotations
 
-import itertools
 import time
 import warnings
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from complexbody import coercivity
 from complexbody.integrators.entries import Run
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
@@ -81,38 +81,19 @@ def limits(problem: Problem, dissipation: str) -> Limits:
 
 
 def smallest_eigenvalue(problem: Problem, number: int) -> float | None:
-    """Smallest relative eigenvalue of region ``number``'s Hessian on (sym U, ν, N); collective.
+    """Smallest relative eigenvalue of region ``number``'s Hessian but for rotations; collective.
 
     Relative: every row and column is scaled by the root of its diagonal, as A1 is checked.
 
     Returns:
         The eigenvalue, or None for an energy that is not quadratic.
     """
-    n_u, n, dim = problem.scene.displacement, problem.disc.n, problem.disc.dim
-    samples = problem.hessian_samples(number)
-    least = np.inf
-    if len(samples):
-        seen = np.abs(samples).max(axis=(0, 2)) > 0
-        keep = [3 * i + j for i in range(n) for j in range(dim)]
-        keep += [i for i in range(3 * n + n_u, 4 * n) if seen[i]]
-        h = samples[:, keep][:, :, keep]
-        d = np.sqrt(np.abs(np.einsum("mii->mi", h)))
-        d = np.where(d > 0, d, d.max(axis=1, keepdims=True, initial=1e-300))
-        for scaled, scale in zip(h / (d[:, :, None] * d[:, None, :]), d, strict=True):
-            basis = _strains(keep, scale, min(n_u, dim))
-            least = min(least, float(np.linalg.eigvalsh(basis.T @ scaled @ basis)[0]))
+    scene = problem.scene
+    least = coercivity.least_eigenvalue(
+        problem.hessian_samples(number), scene.displacement, scene.descriptor, problem.disc.dim
+    )
     least = problem.comm.allreduce(least, op=MPI.MIN)
-    return float(least) if np.isfinite(least) else None
-
-
-def _strains(keep: list[int], scale: Array, dim: int) -> Array:
-    """Orthonormal basis of what is no rigid rotation, shape (kept, kept − rotations)."""
-    rotations = np.zeros((len(keep), dim * (dim - 1) // 2))
-    for column, (i, j) in enumerate(itertools.combinations(range(dim), 2)):
-        rotations[keep.index(3 * i + j), column] = 1.0
-        rotations[keep.index(3 * j + i), column] = -1.0
-    left, _, _ = np.linalg.svd(rotations * scale[:, None], full_matrices=True)
-    return left[:, rotations.shape[1] :]
+    return least if np.isfinite(least) else None
 
 
 def seconds_per_step(run: Run, comm: Any, budget: float = 0.3) -> float:

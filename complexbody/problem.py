@@ -15,15 +15,18 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 from dolfinx import fem
 from mpi4py import MPI
+from ufl.algorithms import expand_derivatives
+from ufl.classes import Zero
 
-from complexbody import _compat, boundary, hessian, native
+from complexbody import _compat, boundary, coercivity, native
 from complexbody.action import Action
 from complexbody.body import Body
 from complexbody.convexity import Convexity, Range
 from complexbody.discretisation import Discretisation
-from complexbody.errors import agree
+from complexbody.errors import CoercivityError, agree
 from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
@@ -56,7 +59,7 @@ class Problem:
         convexity, kinetic_range: Of general χ: how γ, Ξ and T₀ are measured (None if there is no
             such χ), and what they are at the initial state.
         known_steps: Critical steps of owned cells by dissipation scheme, as far as computed [s].
-        warnings: What A1 leaves to the boundary data, in words.
+        warnings: What A1 leaves to the boundary data, and locking, in words.
 
     Raises:
         SceneError, MeshError, BodyError, CoercivityError: for input that cannot be run.
@@ -250,7 +253,7 @@ class Problem:
         """
         n = self.disc.n
         stored, d = self.kernels.densities.stored[number], self.kernels.densities
-        if stored is None or not d.generated[number]:
+        if stored is None or not (d.generated[number] or not stored.expressions()):
             return np.zeros((0, 4 * n, 4 * n))
         samples = np.zeros((1, len(d.coefficients)))
         if stored.expressions():
@@ -265,33 +268,79 @@ class Problem:
                 out[:, i, j] = samples[:, d.coefficients.index(value)]
         return out
 
+    def _outer_samples(self, number: int) -> Array | None:
+        """∂²(ρw)/∂ν∂ν of region ``number``, shape (samples, k, k); None without a potential.
+
+        Where it depends on the state or on the place: at the initial one, at the cells' vertices.
+        """
+        scene, k, w = self.scene, self.scene.descriptor, self.kernels.densities.potential[number]
+        body, first = scene.bodies[number], 3 * self.disc.n + scene.displacement
+        if body.potential is None:
+            return None
+        if w is not None and not w.expressions():
+            own = np.zeros((1, k, k))
+            for (i, j), value in w.hessian.items():
+                if min(i, j) >= first:
+                    own[0, i - first, j - first] = value
+            return own
+        q = fem.Function(self.action.space)
+        self.disc.scatter(self.initial_fields, q)
+        u, nu = self.action.fields(q)[:2]
+        nu = ufl.variable(nu)
+        second = expand_derivatives(ufl.diff(ufl.diff(body.potential(u, nu), nu), nu))
+        if isinstance(second, Zero):  # which FFCx does not compile
+            return None
+        entries = ufl.as_vector([second[i, j] for i in range(k) for j in range(k)])
+        compiled = _compat.expression(entries, _compat.vertex_space(scene.mesh))
+        cells = np.flatnonzero(scene.regions() == number).astype(np.int32)
+        return _compat.evaluate(compiled, scene.mesh, cells).reshape(-1, k, k)
+
     def _check_energy(self) -> list[str]:
-        """A1 for every quadratic region; semidefinite modes are warned of on rank 0."""
-        scene, notes = self.scene, []
-        error: Exception | None = None
-        for r, body in enumerate(scene.bodies):
-            samples = self.hessian_samples(r)
-            if not len(samples):
-                continue
-            try:
-                modes = hessian.check_coercive(
-                    samples, scene.displacement, scene.descriptor, self.disc.dim, body.name
-                )
-            except Exception as found:
-                error = found
-                continue
-            for mode in modes:
+        """A1 and locking of every quadratic region; what is found is told on rank 0."""
+        notes: list[str] = []
+        for r, body in enumerate(self.scene.bodies):
+            samples, shape = self.hessian_samples(r), (self.scene.displacement, self.disc.dim)
+            ratio = coercivity.locking_ratio(samples, *shape)
+            ratio = self.comm.allreduce(ratio, op=MPI.MAX)
+            # Coefficients differ between ranks, and so may what they leave free.
+            modes = self._null_modes(r, samples)
+            if any(self.comm.allgather(bool(modes))):
+                modes = self._null_modes(r, samples, self._outer_samples(r))
+            every = [mode for part in self.comm.allgather(modes) for mode in part]
+            notes += [
+                f"The energy of {body.name} does not see the mode {mode}: only inertia, supports "
+                "or loads hold it."
+                for mode in dict.fromkeys(every)
+            ]
+            if ratio >= coercivity.LOCKING:
                 notes.append(
-                    f"The energy of {body.name} does not see the mode {mode}: only inertia, "
-                    "supports or loads hold it."
+                    f"The energy of {body.name} is nearly incompressible: volume changes cost as "
+                    f"much as with λ/μ = {ratio:.3g}, and P1 cells lock from about "
+                    f"{coercivity.LOCKING:g} on: shear and bending come out too stiff. Use a "
+                    "smaller bulk modulus, or refine until results stay."
                 )
-        agree(self.comm, error)
-        # Coefficients differ between ranks, and so may what they leave free.
-        notes = list(dict.fromkeys(note for part in self.comm.allgather(notes) for note in part))
         if self.comm.rank == 0:
             for note in notes:
                 warnings.warn(note, UserWarning, stacklevel=2)
         return notes
+
+    def _null_modes(self, number: int, samples: Array, outer: Array | None = None) -> list[str]:
+        """Null modes of a region on this rank, in words; collective.
+
+        Raises:
+            CoercivityError: on all ranks if it is not coercive on one.
+        """
+        scene, error, modes = self.scene, None, []
+        name = scene.bodies[number].name
+        try:
+            if len(samples):
+                modes = coercivity.check_coercive(
+                    samples, scene.displacement, scene.descriptor, self.disc.dim, name, outer
+                )
+        except CoercivityError as found:
+            error = found
+        agree(self.comm, error)
+        return modes
 
     def load_forces(self, amplitude: Array) -> None:
         """f += loads with the given factors per group (partial, before the halo's sum)."""

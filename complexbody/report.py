@@ -191,12 +191,13 @@ def energy(problem: Any, number: int, least: float | None) -> str:
     kernel = "generated kernel" if densities.generated[number] else "FFCx kernel"
     if least is None:
         text = f"{body.name}: not quadratic, so A1 depends on the state and is not checked"
-    elif least > 1e-11:
-        text = f"{body.name}: coercive (A1), smallest relative eigenvalue {least:.3g}"
     else:
         about = f"The energy of {body.name} "
-        modes = [note for note in problem.warnings if note.startswith(about)]
-        text = f"{body.name}: semidefinite (A1). {' '.join(modes)}".rstrip(" .")
+        notes = " ".join(note for note in problem.warnings if note.startswith(about))
+        kind = "semidefinite (A1)"
+        if least > 1e-11:
+            kind = f"coercive (A1), smallest relative eigenvalue {least:.3g}"
+        text = f"{body.name}: {kind}. {notes}".rstrip(" .")
     return entry("energy", f"{text}; {kernel}")
 
 

@@ -18,6 +18,7 @@ from mpi4py import MPI
 from complexbody import planning
 from complexbody.errors import SceneError, SolverError
 from complexbody.files import CsvWriter
+from complexbody.instabilities import warn_of
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
 from complexbody.integrators.implicit import Implicit
@@ -140,6 +141,7 @@ class Simulation:
         self.watch = watch
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
+        warn_of(self.problem, method, until)
         self.run_: Run = method.prepare(self.problem, until)
         self.problem.release()
         self.plan = planning.of_run(self.problem, method) if plan else None

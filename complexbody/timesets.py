@@ -24,6 +24,9 @@ from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
 
+#: In the place of a dissipation scheme: ν is held (an infinite inertia), the step is that of u.
+HELD = "held"
+
 
 def cell_densities(problem: Problem) -> Array:
     """ρ of every cell in blocks, shape (blocks, W); padding has 1."""
@@ -126,7 +129,8 @@ class _Region:
         mu = np.empty((*h.shape, self.n))
         mu[..., : self.n_u] = self.rho[..., None]
         m = self.m + 0.25 * h[..., None] ** 2 * self.s
-        mu[..., self.n_u :] = effective(m, self.d, h[..., None], scheme)
+        held = scheme == HELD
+        mu[..., self.n_u :] = np.inf if held else effective(m, self.d, h[..., None], scheme)
         scale = np.ascontiguousarray((1.0 / np.sqrt(mu)).transpose(0, 2, 1))
         if self.matrices is None:
             values = quadratic_eigenvalues(
@@ -143,13 +147,15 @@ class _Region:
     def steps(self, scheme: str) -> Array:
         """Largest h per cell with h²λ_K(h) ≤ 4, shape (blocks, W); inf where nothing limits it."""
         h = np.ones(self.geometry.shape[::2])
-        if not np.any(self.s) and (not np.any(self.d) or scheme == "symmetric"):
+        constant = not np.any(self.s) and (not np.any(self.d) or scheme == "symmetric")
+        if scheme == HELD or constant:
             with np.errstate(divide="ignore"):
                 return 2.0 / np.sqrt(np.maximum(self.eigenvalues(h, scheme), 0.0))
-        # h² λ(h) grows like a power of h between 1 and 2; bracket it from below in log scale.
+        # h² λ(h) grows like a power of h between 1 and 2, which √ratio finds in a few steps; beside
+        # a stiff self-action (s) it hardly grows at all: then by bisection. Both in log scale.
         low, done = np.zeros_like(h), np.zeros(h.shape, dtype=bool)
-        broken = np.zeros(h.shape, np.bool_)
-        for _ in range(60):
+        high, broken = np.full_like(h, np.inf), np.zeros(h.shape, np.bool_)
+        for count in range(80):
             values = self.eigenvalues(h, scheme)
             broken |= np.isnan(values)
             if np.any(broken):
@@ -158,9 +164,13 @@ class _Region:
                 ratio = 4.0 / (h * h * np.maximum(values, 1e-300))
             good = ratio >= 1.0
             low = np.where(good & ~done, np.maximum(low, h), low)
+            high = np.where(good | done, high, np.minimum(high, h))
             unlimited = ratio > 1e200
             # √ratio overshoots upwards and is safe downwards when λ falls with h.
             change = np.where(good, np.sqrt(np.minimum(ratio, 1e12)), np.maximum(ratio, 1e-12))
+            if count >= 12 and np.any(self.s):
+                middle = np.sqrt(low * np.where(np.isinf(high), 16 * low, high)) / h
+                change = np.where(low > 0, middle, change)
             change = np.where(unlimited, 1.0, change)
             # Each cell stops by itself: its step must not depend on who else is on this rank.
             done |= (np.abs(change - 1) < 1e-7) & (good | unlimited)

@@ -15,26 +15,22 @@ the *total error* against the scene's exact solution or a finer mesh
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 
 from complexbody import fronts, machine
 from complexbody.chartfile import ChartFile, write_csv
+from complexbody.chartplan import Plan, label
 from complexbody.contenders import Contender, chosen
-from complexbody.errors import ChartError
 from complexbody.files import on_first_rank
 from complexbody.measuring import Point, told
-from complexbody.references import Exact, Finer, Reference, Semidiscrete
+from complexbody.references import Reference, Semidiscrete
 from complexbody.scene import Scene
-from complexbody.scenefile import accepted
 
 Factory = Callable[..., Scene]
 
@@ -129,7 +125,7 @@ def chart(
         out: Folder of chart.json, .csv and .png. Points that are there already are not run again.
         repeats: Runs of each point, the fastest of which counts.
         budget: Seconds after which a point is not repeated; one that would take longer is left out
-            and says so.
+            and says so, until a chart with a larger budget.
         parameters: More parameters of the function.
         comm: Ranks.
         norm: The error that is judged and drawn, one of :data:`complexbody.fronts.NORMS`.
@@ -144,7 +140,7 @@ def chart(
         ChartError: for requests that make no sense together, or a file of another chart.
         ComplexBodyError: if the scene cannot be run by the reference.
     """
-    plan = _Plan(scene, until, meshes, exact, parameters or {}, comm, steps, repeats, norm)
+    plan = Plan(scene, until, meshes, exact, parameters or {}, comm, steps, repeats, norm)
     identity = {
         "source": plan.digest(source), "until": float(until), "parameters": plan.parameters,
         "ranks": comm.size,
@@ -168,91 +164,11 @@ def chart(
     return made
 
 
-class _Plan:
-    """What is asked for, checked."""
-
-    def __init__(
-        self, scene: Any, until: float, meshes: Any, exact: Any, parameters: Mapping[str, Any],
-        comm: Any, steps: Any, repeats: int, norm: str,
-    ) -> None:  # fmt: skip
-        self.scene_, self.until, self.comm, self.exact = scene, float(until), comm, exact
-        self.parameters, self.steps = dict(parameters), steps
-        self.title, self.dimension = "", 0
-        factory = not isinstance(scene, Scene)
-        wrong = ""
-        if not (np.isfinite(until) and until > 0):
-            wrong = f"until is {until}. Give the end of the runs in seconds, > 0"
-        elif meshes is not None and not factory:
-            wrong = "meshes need a function that makes the scene. Give that, not a scene"
-        elif meshes is not None and (len(meshes) != 1 or not all(len(v) for v in meshes.values())):
-            wrong = f"meshes are {dict(meshes)!r}. Give one parameter and its values"
-        elif not _sensible(steps):
-            wrong = f"steps are {steps!r}. Give how many, or positive factors"
-        elif repeats < 1:
-            wrong = f"repeats is {repeats}. Give 1 or more"
-        elif norm not in fronts.NORMS:
-            wrong = f"norm is {norm!r}. Give one of {', '.join(fronts.NORMS)}"
-        elif meshes is not None and exact is None and comm.size > 1:
-            wrong = (
-                "total errors against a finer mesh need one process. Run it without mpirun, give "
-                "an exact solution, or a single mesh"
-            )
-        if wrong:
-            raise ChartError(f"chart: {wrong}.")
-        self.meshes: dict[str, list[Any]] = {k: list(v) for k, v in (meshes or {}).items()}
-
-    def each(self) -> list[dict[str, Any]]:
-        """Parameters of each mesh, coarse to fine."""
-        return [{k: v} for k, values in self.meshes.items() for v in values] or [{}]
-
-    def scene(self, mesh: Mapping[str, Any]) -> Scene:
-        """The scene on a mesh."""
-        if isinstance(self.scene_, Scene):
-            made = self.scene_
-        else:
-            made = self.scene_(self.comm, **{**self.parameters, **mesh})
-        self.title, self.dimension = made.name, made.mesh.geometry.dim
-        return made
-
-    def digest(self, source: str | bytes | None) -> str:
-        """What knows the scene again."""
-        if source is None:
-            thing = self.scene_
-            try:
-                source = repr(thing) if isinstance(thing, Scene) else inspect.getsource(thing)
-            except (OSError, TypeError):
-                source = getattr(thing, "__qualname__", type(thing).__name__)
-        data = source.encode() if isinstance(source, str) else source
-        return hashlib.sha256(data).hexdigest()
-
-    def total(self, scene: Scene, level: int) -> Reference | None:
-        """What total errors are measured against, if anything."""
-        if self.exact is not None:
-            given = accepted(self.exact, {**self.parameters, **self.each()[0]})
-            return Exact(lambda t: self.exact(t, **given), self.until, scene)
-        if not self.meshes:
-            return None
-        (name, values), *_ = self.meshes.items()
-        finer = {name: 2 * values[-1]}
-        return Finer(self.scene(finer), self.until, level, label(finer))
-
-
-def _sensible(steps: Any) -> bool:
-    if isinstance(steps, int | None):
-        return steps is None or steps > 0
-    return len(steps) > 0 and all(np.isfinite(s) and s > 0 for s in steps)
-
-
-def label(mesh: Mapping[str, Any]) -> str:
-    """A mesh in words."""
-    return ", ".join(f"{k}={v}" for k, v in mesh.items()) or "the scene's"
-
-
 class _Runner:
     """Runs the points that are not there yet."""
 
     def __init__(
-        self, plan: _Plan, file: ChartFile, repeats: int, budget: float, tell: Callable[[str], None]
+        self, plan: Plan, file: ChartFile, repeats: int, budget: float, tell: Callable[[str], None]
     ) -> None:
         self.plan, self.file, self.repeats, self.budget = plan, file, repeats, budget
         self.tell, self.comm = tell, plan.comm
@@ -270,13 +186,18 @@ class _Runner:
                 for factor in self._factors(contender):
                     key = json.dumps([contender.key, float(factor), mesh], default=repr)
                     keys.append(key)
-                    if key not in self.file.rows:
+                    if self._missing(key):
                         todo.append((key, contender, float(factor)))
             if todo:
                 self._mesh(mesh, scene, todo)
         if self.total is not None:
             self.total.close()
         return keys
+
+    def _missing(self, key: str) -> bool:
+        """Whether a point is to be run: also one that was too long for a smaller budget."""
+        row = self.file.rows.get(key)
+        return row is None or (row["status"] == "too long" and row["budget"] < self.budget)
 
     def _factors(self, contender: Contender) -> Sequence[float]:
         steps = 4 if self.plan.steps is None else self.plan.steps
@@ -296,6 +217,7 @@ class _Runner:
             row = {
                 "key": key, "method": contender.name, "peer": contender.peer, "mesh": dict(mesh),
                 "factor": factor, "ranks": self.comm.size, "commit": self.commit,
+                "budget": self.budget,
                 **found.measure(),
             }  # fmt: skip
             self.file.references[name] = reference.about()

@@ -31,9 +31,10 @@ so that, exactly, q²/ω² = ρ/K + ρa²/(w'' − mω² − iωη). The body's 
     \qquad \omega_0^2 = \frac{3\gamma p_0}{\rho_lR_0^2}.
 
 Ka² shifts neither ω0 nor any other term of it: it is the gap's upper edge ω0² + 4πnR0c², where
-q = 0 and where bubbles in a liquid at rest as a whole oscillate. Without shear stiffness,
-transverse motions have no frequency, and e alone does not see div u = aν, which w holds: a scene
-warns of that mode. Left out: heat, radiation by a single bubble, surface tension.
+q = 0 and where bubbles in a liquid at rest as a whole oscillate. e alone does not see div u = aν,
+but w holds that mode. Nothing holds shear: transverse motions have no frequency, and a scene in
+two or three dimensions warns of them. Left out: heat, radiation by a single bubble, surface
+tension.
 
 Sources (recalled, not re-read): Minnaert 1933; Caflisch, Miksis, Papanicolaou and Ting 1985;
 Commander and Prosperetti 1989.

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -63,12 +64,15 @@ def scene(comm):
 """
 _BOTH = (
     "--set --until --integrator --step --safety --dissipation --start --critical --unstable-ok "
-    "--balanced --stabilisation --levels --debug"
+    "--balanced --stabilisation --levels --force --kind --debug"
 )
 OPTIONS = {
-    "run": f"{_BOTH} --out --every --fields --probe --probe-steps --ledger-steps --no-picture "
-    "--speed-up --quiet",
+    "run": f"{_BOTH} --accuracy --out --every --fields --probe --probe-steps --ledger-steps --no-plan "
+    "--no-picture --speed-up --quiet",
     "check": _BOTH,
+    "plan": _BOTH,
+    "stability": "--bars --set --no-map --no-critical --safeties --schedules --dissipation --steps "
+    "--dense --out --no-picture --quiet --debug",
     "chart": "--set --until --methods --meshes --steps --repeats --budget --norm --out --fresh "
     "--quiet --debug",
     "info": "--debug",
@@ -227,6 +231,8 @@ def test_quiet_prints_nothing(bar, call, shared_path):
             ("--integrator", "local-leapfrog", "--stabilisation", "0.1", "--levels", "2"),
             {"integrator": "local-leapfrog", "stabilisation": 0.1, "levels": 2},
         ),
+        (("--integrator", "assembled-leapfrog", "--force", "matrix"), {"force": "matrix"}),
+        (("--integrator", "petsc-ts", "--kind", "cn", "--step", "0.1"), {"kind": "cn"}),
     ],
 )
 def test_options_go_before_defaults(bar, words, settings):
@@ -234,6 +240,20 @@ def test_options_go_before_defaults(bar, words, settings):
     found = commands._settings(parser().parse_args(["run", "bar.py", *words]), file)
     assert {name: found[name] for name in settings} == settings
     assert file.defaults["probes"] == {"mid": (0.5,)}
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("assembled-leapfrog", "--force", "matrix"), "discrete energy identity"),
+        (("newmark", "--step", "0.05"), "linear iterations per step"),
+        (("petsc-ts", "--kind", "theta", "--step", "0.05", "--petsc", "pc_type=sor"), "not limit"),
+    ],
+)
+def test_peers(bar, call, shared_path, words, told):
+    words = ("--integrator", *words, "--no-picture", "--out", shared_path / "out")
+    code, text, err = call("run", bar(), *words)
+    assert (code, err) == (0, "") and told in text, text
 
 
 def test_every_goes_before_times(bar):
@@ -552,6 +572,20 @@ DEFAULTS = {}
     assert f"factor of {200 / 29:.3g} at most" in out
 
 
+def test_check_tells_of_locking(bar, call):
+    text = """
+def scene(comm, lam=60.0):
+    mesh = meshes.rectangle(comm, (0, 0), (1, 1), 4)
+    return cb.Scene(mesh, isotropic_two_field(d=2, lam=lam))
+DEFAULTS = {}
+"""
+    code, out, err = call("check", bar(text), "--set", "lam=60")
+    assert (code, err) == (0, "")
+    assert "coercive (A1), smallest relative eigenvalue" in flat(out)
+    assert "is nearly incompressible: volume changes cost as much as with λ/μ = 60" in flat(out)
+    assert "incompressible" not in flat(call("check", bar(text), "--set", "lam=40")[1])
+
+
 def test_check_tells_bodies_apart(bar, call):
     text = """
 import ufl
@@ -617,8 +651,8 @@ def test_help(call):
     assert call() == (0, out, "")
     assert call("--version") == (0, f"complexbody {cb.__version__}\n", "")
     for command in OPTIONS:
-        assert f"    {command} " in out
-    for later in ("plan", "stability", "resume"):
+        assert re.search(rf"^    {command}\s", out, re.M)
+    for later in ("resume",):
         assert f"    {later} " not in out
 
 

@@ -1,23 +1,18 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Densities read as polynomials equal the same formulas in numpy; A1 is checked mode by mode."""
 
-import warnings
 
 import dolfinx
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from harness import bent, everywhere, refused
+from harness import bent
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import complexbody as cb
 from complexbody import _compat, hessian
-from complexbody.errors import CoercivityError
-from complexbody.forms.two_field import _energy as two_field
-from complexbody.hessian import check_coercive, names, read
-from complexbody.problem import Problem
+from complexbody.hessian import names, read
 
 E = np.array([0.3, -1.2, 0.7])
 A = np.array([[1.0, 0.4, -0.3], [0.2, 2.0, 0.1], [0.5, -0.6, 1.5]])
@@ -297,165 +292,6 @@ def test_coefficients(comm):
     # A cell-wise function has no gradient.
     flat = read(lambda U, nu, N: ufl.grad(lam)[0] * nu[0] + nu[1] ** 2, mesh, 3, 2, "gradients")
     assert flat.cellwise and flat.linear == {} and flat.hessian == {(19, 19): 2.0}
-
-
-# --- A1 ------------------------------------------------------------------------------------------
-
-
-def dense(mesh, energy, n_u, k):
-    """H as check_coercive takes it."""
-    out = np.zeros((1, 4 * (n_u + k), 4 * (n_u + k)))
-    for key, entry in read(energy, mesh, n_u, k, "gradients").hessian.items():
-        out[0][key] = entry
-    return out
-
-
-def coercive(mesh, energy, n_u, k):
-    """Null modes of an energy on a mesh."""
-    return check_coercive(dense(mesh, energy, n_u, k), n_u, k, mesh.geometry.dim, "gum")
-
-
-def test_rotations_are_no_news(comm):
-    """The skew part of U is what objectivity leaves free; one rotation in the plane."""
-    for cells in ((3,), (3, 2), (2, 2, 2)):
-        mesh = bent(comm, cells)
-        modes = coercive(
-            mesh, lambda U, nu, N: ufl.inner(ufl.sym(U), ufl.sym(U)) + ufl.inner(N, N), 3, 2
-        )
-        assert modes == []
-
-
-def test_null_modes_are_told(cube):
-    """Five strains without volume change; a gradient that the energy misses; no rotation."""
-    modes = coercive(cube, lambda U, nu, N: ufl.tr(U) ** 2 + ufl.inner(N, N), 3, 1)
-    assert len(modes) == 5 and not any("N" in mode or "nu" in mode for mode in modes)
-    modes = coercive(
-        cube,
-        lambda U, nu, N: ufl.inner(ufl.sym(U), ufl.sym(U)) + N[0, 0] ** 2 + N[0, 1] ** 2,
-        3, 1,
-    )  # fmt: skip
-    assert modes == ["+1 N13"]
-    # nu1 and a strain that compensate each other.
-    modes = coercive(
-        cube,
-        lambda U, nu, N: ufl.inner(ufl.dev(ufl.sym(U)), ufl.dev(ufl.sym(U)))
-        + (ufl.tr(U) - 2 * nu[0]) ** 2
-        + ufl.inner(N, N),
-        3, 1,
-    )  # fmt: skip
-    assert len(modes) == 1
-    found = dict(reversed(word.split()) for word in zip_pairs(modes[0]))
-    numbers = {name: float(text) for name, text in found.items()}
-    assert set(numbers) == {"U11", "U22", "U33", "nu1"}
-    assert numbers["U11"] + numbers["U22"] + numbers["U33"] == pytest.approx(
-        2 * numbers["nu1"], rel=1e-2
-    )
-
-
-def zip_pairs(text):
-    """'+1 U11 -1 U22' -> ['+1 U11', '-1 U22']."""
-    words = text.split()
-    return [" ".join(words[m : m + 2]) for m in range(0, len(words), 2)]
-
-
-def test_a_descriptor_without_self_action_is_fine(cube):
-    assert coercive(cube, lambda U, nu, N: ufl.inner(U, U) + ufl.inner(N, N), 3, 2) == []
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-9, 1e12])
-def test_the_negative_mode_is_named(cube, unit):
-    """Coupling beyond its bound, whatever the unit of ν."""
-
-    def energy(U, nu, N, coupling):
-        known = 0.5 * ufl.inner(U, U) + 0.5 * ufl.inner(unit * N, unit * N) + 0.5 * nu[0] ** 2
-        return known + coupling * unit * U[0, 1] * N[1, 2]
-
-    assert coercive(cube, lambda *g: energy(*g, 0.999), 3, 2) == []
-    with pytest.raises(CoercivityError) as caught:
-        coercive(cube, lambda *g: energy(*g, -1.01), 3, 2)
-    message = str(caught.value)
-    assert "gum" in message and "(A1)" in message and "Change the constants" in message
-    mode = message.split("along the mode ")[1].split(" it is negative")[0]
-    numbers = {p.split()[1]: float(p.split()[0]) for p in zip_pairs(mode)}
-    if unit == 1.0:
-        assert set(numbers) == {"U12", "N23"} and numbers["U12"] * numbers["N23"] > 0
-    assert float(message.split("relative eigenvalue ")[1].split(",")[0]) == pytest.approx(-0.01)
-
-
-def test_a_zero_diagonal_is_no_excuse(cube):
-    with pytest.raises(CoercivityError, match="U11"):
-        coercive(cube, lambda U, nu, N: U[0, 0] * nu[0] + ufl.inner(N, N), 3, 1)
-
-
-def test_not_a_number(cube):
-    broken = dense(cube, lambda U, nu, N: ufl.inner(U, U), 3, 1)
-    broken[0, 3, 4] = np.nan
-    with pytest.raises(CoercivityError, match=r"gum .* not finite\. Check"):
-        check_coercive(broken, 3, 1, 3, "gum")
-
-
-def test_forms_beyond_their_bound(comm):
-    """The two-field model with its coupling k3 too large, in a scene: on all ranks."""
-    mesh = bent(comm, (3, 2))
-    constants = {"lam": 0.8, "mu": 0.9, "k0": 0.7, "k1": 0.5, "k2": 0.6, "k2_skew": 0.3}
-    constants |= {"k3": 4.0, "k3_sym": 0.25}
-    body = cb.Body(2, two_field(2, **constants), 1.0, 1.0, displacement=2, name="two fields")
-    with refused(CoercivityError, "two fields", "(A1)", "U11", "N11"):
-        Problem(cb.Scene(mesh, body))
-
-
-def test_one_weak_cell(comm):
-    """A coefficient that is too small in one cell of one rank only."""
-    mesh = bent(comm, (9, 8))
-    stiffness = fem.Function(_compat.cell_space(mesh))
-    stiffness.x.array[:] = 2.0
-
-    def energy(U, nu, N):
-        return 0.5 * stiffness * ufl.inner(U, U) + 0.5 * ufl.inner(N, N) + 1.2 * U[0, 0] * N[0, 0]
-
-    body = cb.Body(1, energy, 1.0, 1.0, displacement=2, name="spotted")
-    Problem(cb.Scene(mesh, body)).close()
-    if comm.rank == comm.size - 1:
-        stiffness.x.array[0] = 1.0
-    with refused(CoercivityError, "spotted", "U11", "N11"):
-        Problem(cb.Scene(mesh, body))
-    if comm.rank == comm.size - 1:
-        stiffness.x.array[0] = np.nan
-    with refused(CoercivityError, "spotted", "not finite"):
-        Problem(cb.Scene(mesh, body))
-
-
-def test_null_modes_warn_once(comm):
-    """On rank 0; they are kept on every rank."""
-    mesh = bent(comm, (9, 8))
-    body = cb.Body(1, lambda U, nu, N: ufl.inner(U, U) + N[0, 0] ** 2, 1.0, 1.0, name="striped")
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        problem = Problem(cb.Scene(mesh, body))
-    told = [str(w.message) for w in caught if w.category is UserWarning]
-    assert everywhere(comm, len(told) == (comm.rank == 0))
-    if told:
-        assert "striped" in told[0] and "N12" in told[0] and "supports" in told[0]
-    assert everywhere(comm, len(problem.warnings) == 1)
-    problem.close()
-
-
-def test_null_modes_of_another_rank(comm):
-    """A mode that the energy misses in cells of the last rank only is told by rank 0."""
-    mesh = bent(comm, (9, 8))
-    stiffness = fem.Function(_compat.cell_space(mesh))
-    stiffness.x.array[:] = 0.0 if comm.rank == comm.size - 1 else 2.0
-
-    def energy(U, nu, N):
-        return ufl.inner(U, U) + N[0, 0] ** 2 + stiffness * N[0, 1] ** 2
-
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        problem = Problem(cb.Scene(mesh, cb.Body(1, energy, 1.0, 1.0)))
-    told = [str(w.message) for w in caught if w.category is UserWarning]
-    assert everywhere(comm, len(told) == (comm.rank == 0) and "N12" in "".join(told or ["N12"]))
-    assert everywhere(comm, len(problem.warnings) == 1 and "N12" in problem.warnings[0])
-    problem.close()
 
 
 def test_permutation_sign():

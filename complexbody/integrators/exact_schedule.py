@@ -233,6 +233,11 @@ class ExactSchedule:
         nodes.view(np.float32)[:, :, disc.dim + 1] = alone
         return out
 
+    def restart(self) -> None:
+        """Let all cells act at t = 0 again."""
+        self.counter[:] = 0
+        self.arrays["due"][:] = np.where(np.isfinite(self.arrays["step"]), 0.0, np.inf)
+
     # --- a span ------------------------------------------------------------------------------
 
     def run(self, c: Any, world: Any, start: float, end: float) -> int:

@@ -30,6 +30,8 @@ class ForceRun:
     def __init__(self, problem: Problem, step: float, critical: float) -> None:
         self.problem, self.step, self.critical = problem, step, critical
         self.steps, self.updates, self.ready = 0, 0, False
+        # Whose masses a node has: sums of energies read it too.
+        problem.kernels.state.klass = problem.masses.classes.ctypes.data
 
     @property
     def time(self) -> float:

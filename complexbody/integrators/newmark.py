@@ -19,7 +19,7 @@ from petsc4py import PETSc
 from complexbody import _compat
 from complexbody.integrators.global_newton import REASONS
 from complexbody.integrators.peer_run import PeerRun
-from complexbody.integrators.solvers import KRYLOV, Operator, options
+from complexbody.integrators.solvers import KRYLOV, Operator, options, unsolved
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class NewmarkRun(PeerRun):
             self.ksp.solve(self.right, self.vector)
             self.linear += self.ksp.getIterationNumber()
             reason = self.ksp.getConvergedReason()
-            why = f"the linear solver stopped with reason {reason}" if reason < 0 else ""
+            why = unsolved(reason) if reason < 0 else ""
         else:
             why = self._newton()
         if why:

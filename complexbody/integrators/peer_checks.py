@@ -40,7 +40,7 @@ def require_momenta(method: Any, problem: Problem) -> None:
     """
     name = require(method, problem)
     for body in problem.inertias:
-        if np.linalg.eigvalsh(body.inertia_matrix)[0] <= 0:
+        if np.any(np.linalg.eigvalsh(body.inertia_matrix) <= 0):
             raise IntegratorError(
                 f"{name} needs accelerations, which the descriptor of {body.name} has not: it has "
                 "no inertia. Use Synchronous(), AVI() or AssembledLeapfrog()."
@@ -122,7 +122,7 @@ def limit_rk4(problem: Problem) -> float:
     critical = critical_step(problem, "symmetric")
     rates = [
         scipy.linalg.eigvalsh(body.viscosity_matrix, body.inertia_matrix)[-1]
-        for body in problem.inertias
+        for body in problem.whole.bodies
     ]
     largest = float(max(rates))
     limit = 2.615 / 2 * critical

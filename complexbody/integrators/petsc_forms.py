@@ -31,6 +31,8 @@ INNER = "cb_ts_inner_"
 class SecondOrder:
     """Mq̈ + Dq̇ + r(q) − F for "alpha2"."""
 
+    failed = 0
+
     def __init__(self, run: PetscRun, defaults: dict[str, str]) -> None:
         self.given: Mapping[str, str] = run.method.options
         self.run, self.operator, self._seen = run, Operator(run), 0
@@ -87,6 +89,8 @@ class SecondOrder:
 
 class FirstOrder:
     """(x, v) in one vector, x first, for "rk4"."""
+
+    failed = 0
 
     def __init__(self, run: PetscRun, defaults: dict[str, str]) -> None:
         self.given: Mapping[str, str] = run.method.options
@@ -203,8 +207,8 @@ class Theta(FirstOrder):
         self.inner.solve(self.b, self.dx)
         self._count += self.inner.getIterationNumber()
         if self.inner.getConvergedReason() < 0:
-            dx[:] = np.nan  # seen by SNES on all ranks
-            return
+            # SNES does not look here: the run does.
+            self.failed = self.inner.getConvergedReason()
         dx[:] = self.dx.array_r
         dv[:] = self.shift * dx - a
 

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from complexbody.integrators.global_newton import REASONS
 from complexbody.integrators.peer_run import PeerRun
 from complexbody.integrators.petsc_forms import FirstOrder, SecondOrder, Theta
-from complexbody.integrators.solvers import options
+from complexbody.integrators.solvers import options, unsolved
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -29,9 +29,11 @@ class Form(Protocol):
 
     Attributes:
         given: PETSc options of the user that are the stepper's own.
+        failed: Reason of a linear solver that failed and that SNES does not see, or 0.
     """
 
     given: Mapping[str, str]
+    failed: int
 
     def read(self) -> None:
         """Take x and v from PETSc."""
@@ -82,6 +84,8 @@ class PetscRun(PeerRun):
         if int(ts.getConvergedReason()) < 0:
             reason = int(ts.getSNES().getConvergedReason())
             return f"SNES: {REASONS.get(reason, f'reason {reason}')}"
+        if self.form.failed:
+            return unsolved(self.form.failed)
         self.form.read()
         self.system.q.x.scatter_forward()
         return ""

@@ -17,8 +17,23 @@ if TYPE_CHECKING:
 
 #: Linear solvers of implicit peers, by default.
 KRYLOV = {
-    "ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "10000", "pc_type": "sor",
+    "ksp_type": "cg", "ksp_norm_type": "unpreconditioned", "ksp_max_it": "10000",
+    "pc_type": "bjacobi", "sub_pc_type": "icc",
 }  # fmt: skip
+
+
+#: KSPConvergedReason below zero, in words.
+LINEAR = {
+    -3: "it does not converge within the allowed iterations", -4: "it diverges",
+    -5: "it broke down", -8: "the preconditioner is not positive definite",
+    -9: "values are not finite", -10: "the matrix is not positive definite",
+    -11: "the preconditioner failed",
+}  # fmt: skip
+
+
+def unsolved(reason: int) -> str:
+    """Why a linear solver failed, in words."""
+    return f"the linear solver failed: {LINEAR.get(int(reason), f'reason {reason}')}"
 
 
 def last_line(error: Any) -> str:

@@ -88,8 +88,6 @@ def test_branches():
     assert minnaert() / (2 * math.pi) == pytest.approx(3283, rel=1e-3)
 
 
-# w holds the mode div u = aν, which the energy alone does not see
-@pytest.mark.filterwarnings("ignore:The energy of bubbly liquid does not see:UserWarning")
 @pytest.mark.parametrize("branch", [0, 1])
 def test_standing_wave(comm, branch):
     """Fixed ends, u ∝ sin qx, ν ∝ cos qx: each branch keeps its frequency, error of order 2."""

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """``cb.Implicit`` against exact solutions, the explicit integrator and a plain reference."""
 
-import re
 
 import dolfinx
 import numpy as np
@@ -9,35 +8,15 @@ import pytest
 import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 import ufl
+from dense import halves
 from harness import largest, refused
 from mpi4py import MPI
-from verification.bubbles import Bubble, collapse_time
+from verification.general_inertia import bubble, collapsing, line, powers, stretching
 
 import complexbody as cb
-from complexbody.errors import BodyError, IntegratorError, SolverError, StepError
-from complexbody.forms import bubbly_liquid
-from complexbody.forms.bubbly import number_density
+from complexbody.errors import BodyError, IntegratorError, StepError
 
 QUADRATURES = ("vertex", "consistent")
-
-
-def line(comm, cells=4):
-    """A unit interval."""
-    return dolfinx.mesh.create_interval(comm, cells, [0.0, 1.0])
-
-
-def stretching(U, nu, N):
-    """½(u'² + |∇ν|²)."""
-    return 0.5 * (ufl.inner(U, U) + ufl.inner(N, N))
-
-
-def powers(comm):
-    """½ν³ν̇² and a potential in which y = ν^{5/2} oscillates linearly (first integral)."""
-    body = cb.Body(
-        1, stretching, 1.0, lambda nu, v: 0.5 * nu[0] ** 3 * v[0] ** 2, displacement=1,
-        potential=lambda u, nu: 0.32 * (nu[0] ** 2.5 - 1) ** 2,
-    )  # fmt: skip
-    return cb.Scene(line(comm), body, initial=cb.Initial(nu=1.5**0.4))
 
 
 B, K = 0.8, 2.0
@@ -153,6 +132,20 @@ def test_books_balance_to_second_order(comm):
     assert 1.8 < np.log2(balance[0] / balance[1]) < 2.2, balance
 
 
+@pytest.mark.parametrize("quadrature", QUADRATURES)
+def test_books_know_regions(comm, quadrature):
+    """Kinetic energies of two regions that differ in density and inertia."""
+    mesh = line(comm, 10)
+    bodies = [cb.Body(1, stretching, rho, omega, displacement=1)
+              for rho, omega in ((1.0, 2.0), (5.0, 7.0))]  # fmt: skip
+    scene = cb.Scene(mesh, dict(enumerate(bodies, 1)), cell_tags=halves(mesh),
+                     initial=cb.Initial(u_dot=1.0, nu_dot=2.0))  # fmt: skip
+    method = cb.Implicit(1e-3, quadrature=quadrature, solve="always")
+    ledger = cb.simulate(scene, method, until=1e-2, ledger_steps=1).ledger
+    for name, energy in (("kinetic_u", 1.5), ("kinetic_nu", 9.0)):
+        assert np.abs(ledger[name] - energy).max() < 1e-11, name
+
+
 @pytest.mark.serial
 def test_consistent_inertia_is_leapfrog_with_the_full_mass(comm):
     """SNES with a quadratic χ against M x_{n+1} = M(2x_n − x_{n−1}) − h²Kx_n, M and K by hand."""
@@ -256,40 +249,6 @@ def test_quadratic_is_recognised(comm):
     assert callable(make(lambda nu, v: ufl.inner(v, v) + 0.01 * nu[0] ** 2).body.inertia)
 
 
-def collapsing(comm, potential=lambda u, nu: 2.0 * nu[0]):
-    """A bubble that nothing holds: ν falls to zero, where its inertia ½ν³ν̇² ends."""
-    body = cb.Body(
-        1, lambda U, nu, N: 0.5 * ufl.inner(U, U) + 0.01 * ufl.inner(N, N), 1.0,
-        lambda nu, v: 0.5 * nu[0] ** 3 * v[0] ** 2, displacement=1, potential=potential,
-    )  # fmt: skip
-    return cb.Scene(line(comm), body, initial=cb.Initial(nu=1.0))
-
-
-@pytest.mark.parametrize("quadrature", QUADRATURES)
-def test_collapse_stops_with_the_last_state(comm, shared_path, quadrature):
-    """A clear stop, with time and state; what was reached is returned and written."""
-    seen = []
-
-    def run():
-        try:
-            cb.simulate(
-                collapsing(comm), cb.Implicit(0.01, quadrature=quadrature), until=3.0,
-                ledger_steps=5, output=cb.Output(shared_path / quadrature, every=0.5),
-            )  # fmt: skip
-        except SolverError as error:
-            seen.append(error)
-            raise
-
-    with refused(SolverError, "t = ", "ν = " if quadrature == "vertex" else ""):
-        run()
-    kept = seen[0].result
-    assert 0.3 < kept.time < 1.5 and np.all(np.isfinite(kept.nu.x.array))
-    assert np.all((kept.nu.x.array > 0) & (kept.nu.x.array < 0.9))
-    text = (shared_path / quadrature / "nu.xdmf").read_text()
-    written = [float(t) for t in re.findall(r'<Time Value="([^"]+)"', text)]
-    assert abs(written[-1] - kept.time) < 1e-12, written
-
-
 def test_refusals(comm):
     """Steps above T₀ or the critical one, inertia that is not convex or not finite, options."""
     fast = powers(comm)
@@ -318,19 +277,6 @@ def test_refusals(comm):
             cb.Implicit(**{name: 0.0})
 
 
-def bubble(comm, stretch):
-    """Bubbles in liquid that is held, released from rest at R = stretch R0, and one alone."""
-    body = bubbly_liquid(void_fraction=1e-6, sound_speed=150.0, d=1)
-    scene = cb.Scene(
-        line(comm, 2), body, supports=[cb.Fix("u", "boundary"), cb.Fix("u", lambda x: x[0] < 2)],
-        initial=cb.Initial(nu=1e-3 * (stretch - 1)),
-    )  # fmt: skip
-    c, n = body.constants, number_density(1e-3, 1e-6)
-    S = 4 * np.pi * n * 1e-6 * c["density"] * c["sound_speed"] ** 2
-    return scene, Bubble(1e-3, c["density"], c["pressure"], c["gamma"], S=S)
-
-
-@pytest.mark.filterwarnings("ignore:The energy of bubbly liquid does not see")
 def test_rayleigh_plesset(comm):
     """Free oscillation from 1.6 R0 down to half of it: radius in the period's course, order 2."""
     _, reference = bubble(comm, 1.6)
@@ -343,17 +289,3 @@ def test_rayleigh_plesset(comm):
         found.append(largest(comm, result.nu.x.array - exact))
     assert 1.9 < np.log2(found[0] / found[1]) < 2.1, found
     assert found[1] < 1e-7
-
-
-@pytest.mark.filterwarnings("ignore:The energy of bubbly liquid does not see")
-def test_rayleigh_collapse(comm):
-    """A bubble of 8 R0 falls in about Rayleigh's time; large steps are refused at its bottom."""
-    scene, reference = bubble(comm, 8.0)
-    fall = reference.period(8e-3) / 2
-    assert abs(fall / collapse_time(8e-3, 1000.0, 101325.0) - 1) < 0.1
-    step = fall / 4000
-    result = cb.simulate(scene, cb.Implicit(step), until=0.98 * fall)
-    exact = reference.trajectory(8e-3, [0.0, 0.98 * fall])[0, -1]
-    assert largest(comm, (result.nu.x.array + 1e-3) / exact - 1) < 1e-3
-    with refused(SolverError, "t = ", "ν"):
-        cb.simulate(bubble(comm, 8.0)[0], cb.Implicit(fall / 100), until=1.2 * fall, growth=None)

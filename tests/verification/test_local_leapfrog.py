@@ -13,6 +13,7 @@ import scipy.linalg
 from dense import Dense, Plain, halves, prepared, quadratic, random_hessian, slopes, state
 from harness import everywhere, refused
 from mpi4py import MPI
+from verification.step_maps import spectral_radius
 
 import complexbody as cb
 from complexbody import _compat, meshes
@@ -393,28 +394,6 @@ def test_error_beside_synchronous(comm, dim, cells, amount, pull, eta):
 # --- stability ------------------------------------------------------------------------------------
 
 
-def spectral_radius(scene, method):
-    """Of the undamped step map, from the forces that the run itself gives for unit fields."""
-    run = prepared(scene, method)
-    disc, kernels = run.problem.disc, run.problem.kernels
-    fixed = run.problem.masses.fixed[run.problem.masses.classes[:-1]]
-    columns = []
-    free = list(zip(*np.nonzero(~fixed), strict=True))
-    for node, component in free:
-        kernels.x[:] = 0.0
-        kernels.x[node, component] = 1.0
-        kernels.reset_forces()
-        run.ready = False
-        run.forces()
-        columns.append([kernels.f[a, c] for a, c in free])
-    stiff = -np.array(columns)
-    assert abs(stiff - stiff.T).max() < 1e-12 * abs(stiff).max()
-    root = np.array([np.sqrt(disc.volume[a]) for a, _ in free])
-    s = run.step**2 / 2 * np.linalg.eigvalsh(stiff / np.outer(root, root))
-    roots = [np.roots([1.0, -2.0 + 2.0 * value, 1.0]) for value in (s[0], s[-1])]
-    return max(abs(r).max() for r in roots), run
-
-
 def serial_meshes():
     """Names and meshes of this rank alone: scattered, graded, with islands of small cells."""
     comm = MPI.COMM_SELF
@@ -440,17 +419,6 @@ def test_stable_on_many_meshes():
             assert radius <= 1 + 1e-10, (name, levels, safety, radius)
             count += run.levels > 0
     assert count >= 60
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("ratio", [2, 3, 4, 1.5])
-def test_stable_on_two_rate_bars(ratio):
-    """The bars on which asynchronous steps resonate, for all safety factors to the default."""
-    mesh = bar((10, 1.0), (10, 1 / ratio))
-    for safety in np.append(np.arange(0.3, 0.9, 0.05), DEFAULT.safety):
-        for levels in (1, 2):
-            radius, _ = spectral_radius(pair_scene(mesh), LocalLeapfrog(safety, levels=levels))
-            assert radius <= 1 + 1e-10, (safety, levels, radius)
 
 
 @pytest.mark.serial

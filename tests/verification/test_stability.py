@@ -6,17 +6,15 @@ radius of one step. The cells' bound of the critical step must never be above th
 """
 
 import re
-import warnings
 
 import numpy as np
 import pytest
 from dense import Dense, amplification, halves, prepared, quadratic, random_hessian, state
 from harness import refused
-from mpi4py import MPI
 
 import complexbody as cb
 from complexbody import meshes
-from complexbody.errors import CoercivityError, DivergenceError, StepError
+from complexbody.errors import DivergenceError, StepError
 from complexbody.problem import Problem
 from complexbody.timesets import critical_step
 
@@ -159,57 +157,3 @@ def test_global_critical_step(comm, scheme):
     dense, problem = Dense(mesh, body, hessians=[H]), Problem(cb.Scene(mesh, body))
     own = true_step(dense, scheme, critical_step(problem, scheme))
     assert critical_step(problem, scheme, "global") == pytest.approx(own, rel=1e-3)
-
-
-# --- coercivity (PHYSICS, failure 5) --------------------------------------------------------------
-
-
-def pair(R, A=1.0, K=1.0):
-    def energy(U, nu, N):
-        squares = 0.5 * A * U[0, 0] ** 2 + 0.5 * K * N[0, 0] ** 2
-        return squares + R * U[0, 0] * N[0, 0]
-
-    return cb.Body(1, energy, 1.0, 1.0, displacement=1)
-
-
-@pytest.mark.serial  # up to 15 000 steps of 20 cells
-@pytest.mark.parametrize("power", [2, 3, 4, 5, 6])
-def test_almost_incoercive(power):
-    """R = √(AK)(1 − δ): the slow mode keeps its frequency π√δ, as far as the scheme can know."""
-    delta, cells = 10.0**-power, 20
-    mesh = meshes.interval(MPI.COMM_SELF, 0, 1, cells)
-    sides = [cb.Fix("u", "boundary"), cb.Fix("nu", "boundary")]
-    sine = lambda x: np.sin(np.pi * x[:1])  # noqa: E731
-    initial = cb.Initial(sine, lambda x: -sine(x))
-    scene = cb.Scene(mesh, pair(1 - delta), sides, initial=initial)
-    slow = (1 - (1 - delta)) * 4 * cells**2 * np.sin(np.pi / (2 * cells)) ** 2
-    run = prepared(scene, cb.Synchronous())
-    omega = 2 / run.step * np.arcsin(0.5 * run.step * np.sqrt(slow))
-    assert omega == pytest.approx(np.pi * np.sqrt(delta), rel=0.01)
-    steps = int(0.4 * np.pi / omega / run.step)
-    for _ in range(4):
-        run.advance(steps)
-        field, _ = state(run)
-        amplitude = field[cells // 2]
-        cosine = np.cos(omega * run.time)
-        assert abs(amplitude - [cosine, -cosine]).max() < 1e-8
-
-
-@pytest.mark.parametrize("delta", [-1e-2, -1e-4, -1e-6, -1e-9])
-def test_incoercive(comm, delta):
-    """δ < 0 is refused, by its mode, whatever the units of ν."""
-    for K in (1.0, 1e-18, 1e12):
-        body = pair(np.sqrt(K) * (1 - delta), K=K)
-        mode = ("U11", "N11") if K == 1.0 else ()
-        with refused(CoercivityError, "not coercive", *mode):
-            Problem(cb.Scene(meshes.interval(comm, 0, 1, 5), body))
-
-
-def test_semidefinite(comm):
-    """δ = 0 runs, with a warning that names what only the boundary holds."""
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        Problem(cb.Scene(meshes.interval(comm, 0, 1, 5), pair(1.0)))
-    words = [str(w.message) for w in told if w.category is UserWarning]
-    if comm.rank == 0:
-        assert len(words) == 1 and "U11" in words[0] and "N11" in words[0]

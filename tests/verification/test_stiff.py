@@ -7,19 +7,14 @@ import pytest
 import scipy.linalg
 import ufl
 from harness import largest, refused
+from verification.step_maps import stiffness
+from verification.stiff_bars import bar, start
 
 import complexbody as cb
 from complexbody.errors import CoercivityError, IntegratorError, SceneError
 from complexbody.forms import elastic_voids
 from complexbody.problem import Problem
 from complexbody.timesets import critical_step
-
-
-def bar(comm, body, cells=40, length=1.0, **more):
-    """A bar held at its ends in u, its self-action implicit."""
-    mesh = dolfinx.mesh.create_interval(comm, cells, [0.0, length])
-    return cb.Scene(mesh, body, supports=[cb.Fix("u", "boundary")],
-                    **({"self_action": "implicit"} | more))  # fmt: skip
 
 
 def pair(k0=4.0, c=0.7, eta=0.0, rho=0.5):
@@ -35,12 +30,6 @@ def mode(k0=4.0, c=0.7, rho=0.5, q=np.pi):
     stiff = np.array([[q**2, c * np.sqrt(k0) * q], [c * np.sqrt(k0) * q, 0.5 * q**2 + k0]])
     values, vectors = scipy.linalg.eigh(stiff, np.diag([1.0, rho]))
     return np.sqrt(values[0]), vectors[1, 0] / vectors[0, 0]
-
-
-def start(share, length=1.0):
-    """The mode at its widest."""
-    return cb.Initial(u=lambda x: np.sin(np.pi * x[0] / length),
-                      nu=lambda x: share * np.cos(np.pi * x[0] / length))  # fmt: skip
 
 
 def test_second_order(comm):
@@ -67,14 +56,7 @@ def test_stable_at_the_gradient_step_without_resonance(comm, k0):
     soft = critical_step(Problem(bar(comm, pair(1e-3, 0.0), 12)))
     assert step > 0.8 * soft
     problem.stiffen(step)
-    kernels, disc = problem.kernels, problem.disc
-    size = disc.nodes * disc.n
-    K = np.zeros((size, size))
-    for j in range(size):
-        kernels.x[:] = 0.0
-        kernels.x[j // disc.n, j % disc.n] = 1.0
-        kernels.forces()
-        K[:, j] = -kernels.f[:-1, : disc.n].ravel()
+    K, disc = stiffness(problem), problem.disc
     masses = problem.masses
     rho = np.column_stack([masses.density, masses.inertia[:, 0, 0]])[masses.classes[:-1]]
     M = np.diag((rho * disc.volume[:, None]).ravel())
@@ -82,33 +64,6 @@ def test_stable_at_the_gradient_step_without_resonance(comm, k0):
     # Leapfrog's amplification is on the unit circle for all eigenvalues in [0, 4/h²].
     assert values.min() > -1e-9 * values.max()
     assert step**2 * values.max() <= 4 * (1 + 1e-9)
-
-
-def test_magnesium_with_voids(comm):
-    """Millimetre cells at more than 1000 times the optical step; the slow wave within 1 %."""
-    body, length = elastic_voids(d=1), 0.04
-    c = body.constants
-    q = np.pi / length
-    modulus = c["lambda_"] + 2 * c["mu"]
-    stiff = np.array([[modulus * q**2, c["b"] * q], [c["b"] * q, c["alpha"] * q**2 + c["xi"]]])
-    values, vectors = scipy.linalg.eigh(stiff, np.diag([body.density, body.inertia]))
-    omega, share = np.sqrt(values[0]), vectors[1, 0] / vectors[0, 0]
-    assert omega < 0.97 * q * np.sqrt(modulus / body.density)  # voids soften it
-    scene = bar(comm, body, 40, length, initial=start(share, length))
-    until = 1.75 * 2 * np.pi / omega
-    result = cb.simulate(scene, cb.Synchronous(), until=until)
-    optical = 2 / np.sqrt(c["xi"] / body.inertia)
-    assert result.stats.step > 1000 * optical
-    x = scene.mesh.geometry.x[:, 0]
-    # At a quarter period the error of u is that of the phase.
-    assert largest(comm, result.u.x.array) < 0.01 * 2 * np.pi * 1.75
-    exact = -omega * np.sin(omega * until) * np.sin(np.pi * x / length)
-    assert largest(comm, result.u_dot.x.array - exact) < 0.01 * omega
-    wrong = cb.simulate(
-        bar(comm, elastic_voids(d=1, b=0.0), 40, length, initial=start(0.0, length)),
-        cb.Synchronous(), until=until,
-    )  # fmt: skip
-    assert largest(comm, wrong.u.x.array) > 0.1
 
 
 def test_two_regions_and_damping_stay_stable(comm):

@@ -6,8 +6,9 @@ import pytest
 from dense import halves, prepared, slopes
 from harness import largest
 from mpi4py import MPI
-from verification.test_stiff import mode, pair, start
-from verification.test_windows_stability import radius
+from verification.step_maps import radius
+from verification.stiff_bars import start
+from verification.test_stiff import mode, pair
 
 import complexbody as cb
 from complexbody import meshes

@@ -1,173 +1,25 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Asynchronous windows: resonances where they are predicted, and no growth at the defaults."""
 
-import itertools
 from dataclasses import replace
-from fractions import Fraction
 
 import numpy as np
 import pytest
-from dense import halves, prepared, state
+from dense import prepared, state
 from harness import everywhere
 from mpi4py import MPI
-from verification.cases import CASES, LEFT, build, divisions_of
+from verification.cases import CASES, LEFT, build
+from verification.step_maps import EVERYWHERE, radius
 from verification.waves import pair
 
 import complexbody as cb
-from complexbody import _compat, meshes, native
+from complexbody import meshes, native
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.balance import BEGIN, blending, component_rates, coupling
 from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps
-
-
-def window_map(run):
-    """The matrix of one window on (q, q̇) of the free components and, balanced, the held forces.
-
-    A cell's forces are those of some displacement of its nodes: of all others it never holds any.
-    """
-    problem, balance = run.problem, run.balance
-    disc, n, record = problem.disc, problem.disc.n, problem.disc.record
-    rows, columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
-    size, held = len(rows), []
-    if balance is not None:
-        for block, lane in np.argwhere(disc.source_cell >= 0):
-            held += [(block, lane, basis) for basis in force_basis(run, block, lane)]
-
-    def put(q, v, F):
-        run.record[:-1, :n] = run.record[:-1, record : record + n] = 0.0
-        run.record[rows, columns], run.record[rows, record + columns] = q, v
-        run.record[:, run._time] = run.time
-        if balance is not None:
-            balance.held[:], total = 0.0, np.zeros((disc.nodes + 1, record))
-            run.record[:-1, 2 * record : 2 * record + n] = 0.0
-            for (block, lane, basis), part in zip(held, F, strict=True):
-                if part:
-                    balance.held[block, :, lane] += part * basis
-                    np.add.at(total[:, :n], disc.cells[block, :, lane], part * basis.reshape(-1, n))
-            run.c.cb_accelerate(run._world, native.pointer(total))
-
-    out = np.zeros((2 * size + len(held),) * 2)
-    for j, unit in enumerate(np.eye(len(out))):
-        run.steps = 1
-        put(unit[:size], unit[size : 2 * size], unit[2 * size :])
-        run.advance(1)
-        out[:size, j] = run.record[rows, columns]
-        out[size : 2 * size, j] = run.record[rows, record + columns]
-        out[2 * size :, j] = [balance.held[m, :, lane] @ basis for m, lane, basis in held]
-    return out
-
-
-def force_basis(run, block, lane):
-    """Orthonormal forces that a cell can hold, shape (rank, (d+1)·n)."""
-    disc, balance, rows = run.problem.disc, run.balance, []
-    nodes, n = disc.cells[block, :, lane], disc.n
-    group = next(i for i in range(run.plan.count) if block < run.plan.groups[i].last)
-    for a, i in itertools.product(nodes, range(n)):
-        run.record[:-1, :n] = 0.0
-        run.record[a, i] = 1.0
-        run.record[:, run._time] = run.time
-        run._together(run.time, BEGIN, first=group, last=group + 1)
-        rows.append(balance.held[block, :, lane].copy())
-    values, basis = np.linalg.svd(rows)[1:]
-    return basis[: np.count_nonzero(values > 1e-10 * values[0])]
-
-
-def radius(run):
-    """Spectral radius of the window map."""
-    return abs(np.linalg.eigvals(window_map(run))).max()
-
-
-EVERYWHERE = lambda x: x[0] > -1  # noqa: E731
-
-
-def string(lengths, stiffness=(1.0,), where="boundary", viscosity=0.0):
-    """ν alone on an interval, ρ̄ = 1, stiffness per half; u is held."""
-
-    def body(a):
-        def energy(U, nu, N):
-            return 1e-4 * U[0, 0] ** 2 + 0.5 * a * N[0, 0] ** 2
-
-        return cb.Body(1, energy, 1.0, 1.0, viscosity, displacement=1)
-
-    mesh = meshes.graded_interval(MPI.COMM_SELF, lengths)
-    supports = [cb.Fix("nu", where), cb.Fix("u", EVERYWHERE)]
-    if len(stiffness) == 1:
-        return cb.Scene(mesh, body(stiffness[0]), supports)
-    bodies = {tag: body(a) for tag, a in zip((1, 2), stiffness, strict=True)}
-    return cb.Scene(mesh, bodies, supports, cell_tags=halves(mesh, 0.5 * sum(lengths)))
-
-
-BANDS = [(2, [(1.155, 1.414)]), (3, [(0.902, 1.0), (1.581, 1.732)])]
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("ratio, bands", BANDS)
-def test_two_springs(ratio, bands):
-    """PHYSICS "Where methods fail" 1: the resonance of two springs, at its predicted rate."""
-    found = []
-    for omega in np.linspace(0.8, 1.75, 39):
-        # Two cells of length 1 around a mass 1: k₂ = 1, k₁ = 1/n², critical steps n and 1.
-        scene = string([1.0, 1.0], (1.0 / ratio**2, 1.0))
-        window = ratio * omega
-        run = prepared(scene, AVI(safety=omega, balanced=False), window)
-        assert run.step == pytest.approx(window) and sorted(divisions_of(run)) == [1, ratio]
-        matrix = window_map(run)
-        theta = 2 * np.arcsin(omega / 2)
-        c = window * omega / ratio**2 / np.sin(theta)
-        trace = 2 * np.cos(ratio * theta) - c * np.sin(ratio * theta)
-        assert np.trace(matrix) == pytest.approx(trace, abs=1e-12)
-        predicted = abs(np.roots([1, -trace, 1])).max()
-        growth = abs(np.linalg.eigvals(matrix)).max()
-        assert growth == pytest.approx(predicted, abs=1e-7)
-        found.append((omega, growth))
-        if growth > 1.05:
-            rows = np.array([np.linalg.matrix_power(matrix, k) @ [1.0, 0.3] for k in (50, 51)])
-            first, second = np.linalg.norm(rows, axis=1)
-            assert second / first == pytest.approx(growth, rel=0.02)
-    for omega, growth in found:
-        distance = min(abs(omega - end) for band in bands for end in band)
-        if distance > 2e-3:
-            inside = any(low < omega < high for low, high in bands)
-            assert (growth > 1 + 1e-6) == inside, (omega, growth)
-
-
-def two_rates(ratio, safety, viscosity=0.0):
-    """10 + 10 cells of lengths ``ratio`` to 1, c = 1, h_K = α L_K, plain windows; left end held."""
-    ratio = Fraction(ratio)
-    length = 1 / (10 + 10 * ratio)
-    lengths = [float(ratio * length)] * 10 + [float(length)] * 10
-    problem = Problem(string(lengths, where=LEFT, viscosity=viscosity))
-    corner = problem.scene.mesh.geometry.x[_compat.cell_nodes(problem.scene.mesh), 0].min(axis=1)
-    coarse = corner < float(10 * ratio * length) - 1e-9
-    problem.arrange(np.where(coarse, ratio.denominator, ratio.numerator))
-    window = safety * float(ratio * length) * ratio.denominator
-    return WindowRun(problem, AVI(balanced=False), window, 1.0)
-
-
-@pytest.mark.serial
-@pytest.mark.parametrize("ratio, first", [("2", 0.726), ("3", 0.56), ("4", 0.467), ("3/2", 0.513)])
-def test_two_rate_bar(ratio, first):
-    """PHYSICS "Where methods fail" 2: the first α that fails, none at 0.45, damping cures."""
-    growth = {a: radius(two_rates(ratio, a)) for a in (0.45, *(first + 2.5e-4 * np.arange(-3, 4)))}
-    assert growth.pop(0.45) < 1 + 1e-9
-    worst = max(growth, key=growth.get)
-    assert 1 + 2e-4 < growth[worst] < 1 + 2e-3, growth
-    run = two_rates(ratio, worst)
-    # A run grows so: by e^(rate t), once the mode that does has left the others behind.
-    run.record[:-1, 1] = np.random.default_rng(1).normal(size=run.problem.disc.nodes)
-    run.record[:-1, 1] *= ~run.problem.masses.fixed[run.problem.masses.classes[:-1], 1]
-    windows, norms = round(12 / (growth[worst] - 1)), []
-    for _ in range(2):
-        run.advance(windows)
-        norms.append(np.linalg.norm(run.sample()[0][:-1, 1]))
-    measured = (norms[1] / norms[0]) ** (1 / windows)
-    assert measured - 1 == pytest.approx(growth[worst] - 1, rel=0.15)
-    rate = (growth[worst] - 1) / run.step
-    assert radius(two_rates(ratio, worst, viscosity=2.5 * rate)) < 1
-
 
 # Small meshes, scattered and graded. No AVI is stable for every mesh; these are samples.
 
