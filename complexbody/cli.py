@@ -77,6 +77,10 @@ def parser() -> argparse.ArgumentParser:
     run = command("run", commands.run, "run a scene file", RUN_EPILOG)
     _scene(run)
     _integrator(run)
+    run.add_argument(
+        "--accuracy", metavar="EPS", type=float,
+        help="choose integrator and step, by short runs, for this relative error at the end",
+    )  # fmt: skip
     _output(run)
     check = command(
         "check", commands.check,

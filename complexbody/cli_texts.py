@@ -35,6 +35,7 @@ to DIR: run.json (what was run, and how it ended), ledger.csv, FIELD.xdmf with F
 examples:
   complexbody run demos/impact.py --set refine=1.5 --every 1e-7 --out results/fine
   complexbody run demos/impact.py --dissipation forward --start one-sided
+  complexbody run demos/impact.py --accuracy 1e-2
   complexbody run demos/impact.py --integrator local-leapfrog --levels 3
   complexbody run demos/impact.py --fields u,stress --probe tip=1,0.5,0 --no-picture
   mpirun -n 4 complexbody run demos/impact.py

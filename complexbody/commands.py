@@ -23,6 +23,7 @@ from typing import Any
 from mpi4py import MPI
 
 from complexbody import machine, precheck, report
+from complexbody.accuracy import Accurate
 from complexbody.errors import CommandError, MissingPackage
 from complexbody.files import on_first_rank
 from complexbody.integrators.asynchronous import AVI
@@ -73,6 +74,11 @@ class Job:
     def ledger_steps(self) -> int | None:
         """Steps between ledger rows."""
         return self.settings.get("ledger_steps")
+
+    @property
+    def accuracy(self) -> float | None:
+        """Relative error to meet, if asked for."""
+        return self.settings.get("accuracy")
 
     def output(self) -> Output:
         """What to write, and where.
@@ -125,6 +131,16 @@ def _settings(a: argparse.Namespace, file: SceneFile) -> dict[str, Any]:
         settings["options"] = {name: str(value) for name, value in given_options.items()}
     if given.get("probe"):
         settings["probes"] = {**settings.get("probes", {}), **points(given["probe"])}
+    if given.get("accuracy") is not None:
+        chosen = ("integrator", *_OPTIONS)
+        both = [name for name in chosen if given.get(name) is not None]
+        if both:
+            raise CommandError(
+                f"--accuracy chooses integrator and step, and --{both[0].replace('_', '-')} is "
+                "given as well. Give one of them."
+            )
+        settings = {name: value for name, value in settings.items() if name not in chosen}
+        settings["accuracy"] = given["accuracy"]
     return settings
 
 
@@ -163,15 +179,22 @@ def run(a: argparse.Namespace, ranks: Any) -> None:
         output = job.output()
         growth = None if job.settings.get("unstable_ok") else 10.0
         progress = False if a.quiet else None
-        simulation = Simulation(
-            job.scene, job.method, until=until, output=output, ledger_steps=job.ledger_steps,
-            growth=growth, progress=progress, plan=not a.no_plan,
-        )  # fmt: skip
+        options: dict[str, Any] = {
+            "until": until, "output": output, "ledger_steps": job.ledger_steps, "growth": growth,
+            "progress": progress, "plan": not a.no_plan,
+        }  # fmt: skip
+        if job.accuracy is None:
+            runner: Any = Simulation(job.scene, job.method, **options)
+            simulation, name = runner, job.name
+        else:
+            runner = Accurate(job.scene, job.accuracy, **options)
+            simulation = runner.simulation
+            name = next(n for n, kind in INTEGRATORS.items() if kind is type(simulation.method))
     if not a.quiet:
-        say(ranks, *report.before(simulation, job.name, job.method, output, until))
+        say(ranks, *report.before(simulation, name, simulation.method, output, until))
     with _recorded(a, job, output, ranks) as done:
         with together(ranks):
-            result = simulation.run()
+            result = runner.run()
         done.update(report.results(result))
         if not a.quiet:
             say(ranks, *report.after(result))

@@ -52,6 +52,10 @@ class ChartError(ComplexBodyError, ValueError):
     """A chart cannot be made of this scene, or its file is of another chart."""
 
 
+class AccuracyError(ComplexBodyError, ValueError):
+    """An accuracy is asked for that the mesh cannot give, or that makes no sense."""
+
+
 class MissingPackage(ComplexBodyError, ImportError):
     """An optional package or a compiler is not there; the message has the install line."""
 

@@ -111,6 +111,25 @@ class Table:
         return np.interp(np.asarray(t, dtype=np.float64), self.times, self.values)
 
 
+@dataclass(frozen=True)
+class Shifted:
+    """Another history, seen from ``start`` [s]: its factor at start + t."""
+
+    history: History
+    start: float
+
+    def __call__(self, t: Any) -> Any:
+        """The factor at the times ``t`` [s] after the start."""
+        return self.history(np.asarray(t, dtype=np.float64) + self.start)
+
+
+def shifted(history: History, start: float) -> History:
+    """A history whose time 0 is ``start`` [s] of what it was before any shift."""
+    if isinstance(history, Constant):
+        return history
+    return Shifted(history.history if isinstance(history, Shifted) else history, float(start))
+
+
 def constant() -> Constant:
     """The factor 1 at all times."""
     return Constant()

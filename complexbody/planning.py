@@ -203,7 +203,7 @@ def _steps(problem: Problem, found: Limits) -> Finding:
     )  # fmt: skip
 
 
-def _sizes(problem: Problem) -> tuple[float, float]:
+def sizes(problem: Problem) -> tuple[float, float]:
     """Size of the median cell, |K|^(1/d), and of the body's box [m]; collective."""
     disc, comm = problem.disc, problem.comm
     volume = disc.geometry[:, -1, :][disc.source_cell >= 0] ** 2
@@ -236,7 +236,7 @@ def _matrices(problem: Problem, number: int) -> tuple[Array, Array, Array] | Non
 
 
 def _scales(problem: Problem, found: Limits, until: float | None) -> tuple[Scale, ...]:
-    cell, size = _sizes(problem)
+    cell, size = sizes(problem)
     best: dict[tuple[str, str], float] = {}
     for r in range(len(problem.scene.bodies)):
         # Samples differ between ranks; rank 0 has some region's only where it has its cells.

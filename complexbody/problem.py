@@ -27,6 +27,7 @@ from complexbody.body import Body
 from complexbody.convexity import Convexity, Range
 from complexbody.discretisation import Discretisation
 from complexbody.errors import CoercivityError, agree
+from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
 from complexbody.masses import Masses
@@ -58,6 +59,7 @@ class Problem:
         convexity, kinetic_range: Of general χ: how γ, Ξ and T₀ are measured (None if there is no
             such χ), and what they are at the initial state.
         quiet: Whether runs may skip cells at rest, which changes no bit.
+        known_steps: Critical steps of owned cells by dissipation scheme, as far as computed [s].
         warnings: What A1 leaves to the boundary data, and locking, in words.
 
     Raises:
@@ -79,6 +81,7 @@ class Problem:
         self._read_inertia()
         self.node_step: float | Array = 0.0
         self.quiet = True
+        self.known_steps: dict[str, Array] = {}
         self.arrange()
         self.warnings = self._check_energy()
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
@@ -108,7 +111,7 @@ class Problem:
         """Give up what only steps and stiffnesses of all components needed; collective."""
         if self.full is not self:
             self.full.close()
-            self.full = self
+            self.full, self.known_steps = self, {}
 
     def spread(self, values: Array) -> Array:
         """Values of the scene's components (…, n) among zeros for those left out (…, n_u + k)."""
@@ -151,16 +154,19 @@ class Problem:
     def arrange(self, group: npt.NDArray[np.int64] | None = None) -> None:
         """Lay out cells and nodes (anew), cells of one block being of one group; collective.
 
+        What is laid out so already stays.
+
         Args:
             group: A whole number per owned cell, or None for one group.
         """
-        scene = self.scene
-        if hasattr(self, "disc"):
-            self.disc.halo.close()
-        moving = self.supports.moving
-        self.disc = Discretisation(scene, np.flatnonzero(moving.any(axis=1)), group)
+        scene, moving = self.scene, self.supports.moving
+        if not self._laid_out(group):
+            if hasattr(self, "disc"):
+                self.disc.halo.close()
+            self.disc = Discretisation(scene, np.flatnonzero(moving.any(axis=1)), group)
+            self.kernels = Kernels(self.action, self.disc)
+            self._group = None if group is None else np.array(group)
         disc = self.disc
-        self.kernels = Kernels(self.action, disc)
         fixed = self.supports.fixed[disc.dof]
         if not hasattr(self, "self_stiffness"):
             self.self_stiffness = np.zeros((len(scene.bodies), scene.descriptor, scene.descriptor))
@@ -171,10 +177,13 @@ class Problem:
         self.kernels.select(self.masses.diagonal, damped=False)
         rows, columns = np.nonzero(moving[disc.dof])
         self.moving = rows.astype(np.int64), columns.astype(np.int32)
-        number = disc.number
-        self.load_position = number[self.loads.node] * disc.record + self.loads.component
-        self.load_group, self.load_value = self.loads.group, self.loads.value
+        self._lay_loads()
         self._initial(*self.start, fixed)
+
+    def _lay_loads(self) -> None:
+        loads, disc = self.loads, self.disc
+        self.load_position = disc.number[loads.node] * disc.record + loads.component
+        self.load_group, self.load_value = loads.group, loads.value
 
     def stiffen(self, step: float | Array) -> None:
         """Give nodes the inertia Ω + h²S/4 of an implicit self-action; kept by ``arrange``.
@@ -201,6 +210,30 @@ class Problem:
         x0[rows, columns] = sup.targets(dofs, columns, 0.0)
         v0[rows, columns] = 0.0
         self.initial_fields, self.initial_rates = x0, v0
+
+    def _laid_out(self, group: npt.NDArray[np.int64] | None) -> bool:
+        """Whether cells are in these groups already, on all ranks; collective."""
+        if not hasattr(self, "disc"):
+            return False
+        if group is None or self._group is None:
+            return group is None and self._group is None
+        return bool(self.comm.allreduce(np.array_equal(group, self._group), op=MPI.LAND))
+
+    def restart(self, fields: Array, rates: Array, t: float) -> None:
+        """Let the next runs begin with another state, at the time ``t`` of the scene's histories.
+
+        Args:
+            fields: (u, ν) of this rank's geometry nodes, shape (geometry nodes, n).
+            rates: Of the same.
+            t: Time [s], from which runs count theirs; runs already made are of no more use.
+        """
+        self.start = fields, rates
+        if not self.kernels.densities.linear:
+            self.known_steps = {}
+        for histories in (self.loads.histories, self.supports.histories):
+            histories[:] = [shifted(history, t) for history in histories]
+        self._lay_loads()
+        self._initial(fields, rates, self.supports.fixed[self.disc.dof])
 
     def targets(self, t: float) -> Array:
         """Prescribed values of the moving components at time t, in the order of ``moving``."""

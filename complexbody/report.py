@@ -180,6 +180,7 @@ def after(result: Result) -> list[str]:
         entry("time", times),
         entry("rate", f"{s.rate / s.ranks / 1e6:.3g} million cell updates per second and core"),
         *([entry("solving", result.solving)] if result.solving else []),
+        *([entry("accuracy", str(result.accuracy))] if result.accuracy else []),
         entry("ledger", ledger.summary(result.ledger)),
     ]
 
@@ -254,6 +255,8 @@ def results(result: Result) -> dict[str, Any]:
     """What run.json keeps of a run: statistics, final ledger row, numbers of the time sets."""
     row = dict(zip(result.ledger.columns, result.ledger.rows[-1], strict=True))
     out = {"statistics": asdict(result.stats), "ledger": row}
+    if result.accuracy is not None:
+        out["accuracy"] = {**vars(result.accuracy), "method": repr(result.accuracy.method)}
     if result.time_sets is not None:
         out["time_sets"] = {
             name: value for name, value in vars(result.time_sets).items() if np.isscalar(value)

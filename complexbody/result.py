@@ -61,6 +61,7 @@ class Result:
         integrator: How.
         time_sets: Who acted when, and what that saves; None where all cells act together.
         plan: What was left out since it changes no result; None if nothing was to be.
+        accuracy: What was asked for and what was found, where an accuracy was asked for.
         solving: What implicit steps took and γ, Ξ and T₀ of the inertia, in words; "" if explicit.
     """
 
@@ -78,3 +79,4 @@ class Result:
     time_sets: TimeSets | None = None
     solving: str = ""
     plan: Plan | None = None
+    accuracy: Any = None

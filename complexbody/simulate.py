@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time as clock
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -49,6 +50,7 @@ def simulate(
     progress: bool | None = None,
     plan: bool = True,
     quiet: bool | None = None,
+    accuracy: float | None = None,
 ) -> Result:
     """Run a scene from t = 0 to ``until``; collective.
 
@@ -65,6 +67,8 @@ def simulate(
         plan: Leave out what changes no result (:func:`complexbody.planning.plan`); False: nothing.
         quiet: Skip cells at rest that nothing has reached yet: the same results to the bit
             (``Synchronous`` and windows of ``AVI``; the others act on all cells).
+        accuracy: Relative error to meet at the end, in place of an integrator: the larger one of u
+            and ν (L2), over their largest norms (:mod:`complexbody.accuracy`).
 
     Returns:
         Fields at the final time, ledger, probes and statistics.
@@ -72,14 +76,44 @@ def simulate(
     Raises:
         ComplexBodyError: of a kind that says what is wrong, on all ranks.
     """
-    return Simulation(
-        scene, integrator, until=until, output=output, ledger_steps=ledger_steps, growth=growth,
-        progress=progress, plan=plan, quiet=quiet,
-    ).run()  # fmt: skip
+    options: dict[str, Any] = {
+        "until": until, "output": output, "ledger_steps": ledger_steps, "growth": growth,
+        "progress": progress, "plan": plan, "quiet": quiet,
+    }  # fmt: skip
+    if accuracy is None:
+        return Simulation(scene, integrator, **options).run()
+    from complexbody.accuracy import Accurate  # it stands above: it makes simulations
+
+    return Accurate(scene, accuracy, integrator, **options).run()
+
+
+def require_until(until: float) -> None:
+    """Refuse what is no end of a run.
+
+    Raises:
+        SceneError: for it.
+    """
+    if not (np.isfinite(until) and until > 0):
+        raise SceneError(f"simulate: until is {until}. Give the end of the run in seconds, > 0.")
+
+
+class Watch(Protocol):
+    """Who looks at a run as it goes; may raise to end it.
+
+    Attributes:
+        looks: How often, about.
+    """
+
+    looks: int
+
+    def look(self, run: Run, problem: Problem) -> None:
+        """Look at a run between two steps; collective."""
 
 
 class Simulation:
     """A simulation that is ready to run: what :func:`simulate` makes and runs; same arguments.
+
+    Beside those, ``watch`` looks at the run.
 
     Attributes:
         problem, run_: The scene made ready, and the integrator's run.
@@ -101,15 +135,14 @@ class Simulation:
         progress: bool | None = None,
         plan: bool = True,
         quiet: bool | None = None,
+        watch: Watch | None = None,
     ) -> None:
         begun = clock.perf_counter()
-        if not (np.isfinite(until) and until > 0):
-            raise SceneError(
-                f"simulate: until is {until}. Give the end of the run in seconds, > 0."
-            )
+        require_until(until)
         if ledger_steps is not None and ledger_steps < 1:
             raise SceneError(f"simulate: ledger_steps is {ledger_steps}. Give 1 or more.")
         self.method = method = integrator or Synchronous()
+        self.watch = watch
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
         warn_of(self.problem, method, until)
@@ -188,6 +221,9 @@ class Simulation:
             if self.receivers is not None:
                 stride = self.receivers.stride
                 stop = min(stop, (run.steps // stride + 1) * stride)
+            if self.watch is not None:
+                stride = self._looks()
+                stop = min(stop, (run.steps // stride + 1) * stride)
             if pending:
                 stop = min(stop, int(np.floor(pending[0] / run.step + 1e-9)))
             if stop > run.steps:
@@ -216,6 +252,13 @@ class Simulation:
             self.receivers.record(run.time, run.positions())
         if run.steps % self.every == 0 and run.steps < self.last:
             self._book()
+        if self.watch is not None and (run.steps % self._looks() == 0 or run.steps == self.last):
+            self.watch.look(run, self.problem)
+
+    def _looks(self) -> int:
+        """Steps between two looks of whoever watches."""
+        assert self.watch is not None
+        return max(1, self.last // self.watch.looks)
 
     def _between(self, pending: list[float], tiny: float) -> list[float]:
         """Write all times due before the next step's end, by Hermite interpolation."""

@@ -207,13 +207,19 @@ def cell_steps(problem: Problem, scheme: str = "exact") -> Array:
         IntegratorError: if the scheme cannot take a body without inertia.
         StepError: if a cell's stiffness is not finite.
     """
-    disc = problem.disc
-    if problem.full is not problem:
+    disc, own = problem.disc, problem.known_steps.get(scheme)
+    if own is None:
         # What is left out changes no step: with and without, a run is the same.
-        every, source = cell_steps(problem.full, scheme), problem.full.disc.source_cell
+        every, source = _cell_steps(problem.full, scheme), problem.full.disc.source_cell
         own = np.zeros(disc.count)
         own[source[source >= 0]] = every[source >= 0]
-        return np.where(disc.source_cell < 0, np.inf, disc.cell_values(own[:, None])[:, 0, :])
+        problem.known_steps[scheme] = own
+    return np.where(disc.source_cell < 0, np.inf, disc.cell_values(own[:, None])[:, 0, :])
+
+
+def _cell_steps(problem: Problem, scheme: str) -> Array:
+    """The same of a problem with all components, computed; collective."""
+    disc = problem.disc
     rho = cell_densities(problem)
     out = np.full((disc.blocks, disc.lanes), np.inf)
     for r in range(len(problem.scene.bodies)):

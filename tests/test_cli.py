@@ -67,8 +67,8 @@ _BOTH = (
     "--balanced --stabilisation --levels --force --kind --debug"
 )
 OPTIONS = {
-    "run": f"{_BOTH} --out --every --fields --probe --probe-steps --ledger-steps --no-plan "
-    "--no-picture --speed-up --quiet",
+    "run": f"{_BOTH} --accuracy --out --every --fields --probe --probe-steps --ledger-steps "
+    "--no-plan --no-picture --speed-up --quiet",
     "check": _BOTH,
     "plan": _BOTH,
     "stability": "--bars --set --no-map --no-critical --safeties --schedules --dissipation --steps "

@@ -123,8 +123,11 @@ class LocalLeapfrog:
         """
         require_constant_inertia(problem, "LocalLeapfrog")
         if self.levels != 0:
-            for body in problem.scene.bodies:
-                _require_semilinear(problem, body)
+            for body, read in zip(
+                problem.scene.bodies, problem.kernels.densities.stored, strict=True
+            ):
+                if read is None:  # else quadratic in everything
+                    _require_semilinear(problem, body)
         ratio = 2 * np.sqrt(self.gamma)
         cells, safety = cell_steps(problem, self.dissipation), self.safety
         if problem.scene.self_action == "implicit":

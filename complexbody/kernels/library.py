@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +92,10 @@ class Densities:
         return out
 
 
+#: What was read, by action: a problem is laid out anew often, its densities stay.
+_read: WeakKeyDictionary[Action, Densities] = WeakKeyDictionary()
+
+
 class Kernels:
     """Forces and energies of a discretised scene, and the arrays they work on.
 
@@ -102,7 +107,9 @@ class Kernels:
 
     def __init__(self, action: Action, disc: Discretisation) -> None:
         self.action, self.disc = action, disc
-        self.densities = Densities(action)
+        if action not in _read:
+            _read[action] = Densities(action)
+        self.densities = _read[action]
         if action.scene.lumped and not all(self.densities.generated):
             raise SceneError(
                 f"self_action={action.scene.self_action!r} needs quadratic energies with "
