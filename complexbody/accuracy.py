@@ -22,13 +22,13 @@ from __future__ import annotations
 
 import time as clock
 import warnings
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from complexbody.asked import Accuracy, Parting
 from complexbody.candidates import candidates, halved, name_of, scaled
 from complexbody.errors import AccuracyError
 from complexbody.histories import Constant
@@ -63,64 +63,8 @@ ROOM = 0.7
 ONSET = 1e-2
 
 
-@dataclass(frozen=True)
-class Accuracy:
-    """What was asked for, and what was found.
-
-    Attributes:
-        asked: The relative error; norm: of what.
-        method: What ran; factor: its steps over those at its stable limit.
-        predicted: Error in time before the run; verified: by halving steps in windows of the run.
-        mesh: Estimate of the mesh's own error; a few tens of per cent off where waves span many
-            cells, too small where singularities rule it.
-        met: Whether ``verified`` and ``mesh`` together are at most what was asked.
-        tried: Methods, with the cost (over the least) at which they would meet the request.
-        updates, share: Cell updates of all pilot runs over those of the run; the same in time.
-        restarts: How often the run began anew.
-    """
-
-    asked: float
-    norm: str
-    method: Any
-    factor: float
-    predicted: float
-    verified: float
-    mesh: float
-    met: bool
-    tried: dict[str, float] = field(default_factory=dict)
-    updates: float = 0.0
-    share: float = 0.0
-    restarts: int = 0
-
-    def __str__(self) -> str:
-        others = ", ".join(f"{name} {cost:.2g}" for name, cost in self.tried.items())
-        return (
-            f"asked {self.asked:.3g} ({self.norm}); in time {self.verified:.2g} by halved steps "
-            f"({self.predicted:.2g} expected), of the mesh about {self.mesh:.2g}: "
-            f"{'met' if self.met else 'MISSED'}; {type(self.method).__name__} at "
-            f"{self.factor:.3g} of its stable limit (costs: {others}); pilot runs "
-            f"{self.updates:.2g} of the run's updates, {self.share:.2g} of its time"
-            + (f"; begun anew {self.restarts} times" if self.restarts else "")
-        )
-
-
 class _Again(Exception):
     """The run would miss the request."""
-
-
-@dataclass(frozen=True)
-class _Parting:
-    """Amplitudes of u and ν (2,) by which two runs part at a window's middle and end.
-
-    ``own`` are those of the motion itself there.
-    """
-
-    middle: Array
-    end: Array
-    own: Array
-
-    def __mul__(self, factor: float) -> _Parting:
-        return _Parting(self.middle * factor, self.end * factor, self.own)
 
 
 class Accurate:
@@ -173,8 +117,8 @@ class Accurate:
         pilots, problem = self.pilots, self.pilots.problem
         self._own, self._reach = (np.zeros(2) for _ in range(2))
         self._history: list[tuple[float, Array]] = []
-        self._time: list[_Parting] = []
-        self._space: list[_Parting] = []
+        self._time: list[Parting] = []
+        self._space: list[Parting] = []
         self.work = 0
         self.factor, self.predicted, self.restarts = 1.0, np.nan, 0
         self.tried: dict[str, float] = {}
@@ -236,11 +180,11 @@ class Accurate:
         ends = [f + (f - c) * share for f, c in zip(fine.ends, coarse.ends, strict=True)]
         return coarse, ends
 
-    def _parting(self, begin: Moment, ends: Any, exact: Any) -> _Parting:
+    def _parting(self, begin: Moment, ends: Any, exact: Any) -> Parting:
         middle, end = (e - x for e, x in zip(ends, exact, strict=True))
         reach = self.pilots.reach(begin, end)
         parts = [self.pilots.amplitude(m, reach, 0.5) for m in (middle, end)]
-        return _Parting(parts[0], parts[1], self._own)
+        return Parting(parts[0], parts[1], self._own)
 
     def _see(self, moment: Moment, anew: bool = True) -> None:
         """Know the amplitudes of the motion itself; ``anew``: also how far its rates reach."""
@@ -258,7 +202,7 @@ class Accurate:
         most = np.max([q for _, q in self._history], axis=0)
         return np.asarray(mean / self.pilots.floored(most))
 
-    def _error(self, parts: list[_Parting]) -> float:
+    def _error(self, parts: list[Parting]) -> float:
         """Relative error at the end from windows."""
         if not parts:
             return 0.0
@@ -309,7 +253,7 @@ class Accurate:
                 raise _Again
         self._take(*best[1:])
 
-    def _take(self, method: Any, factor: float, step: float, parts: _Parting) -> None:
+    def _take(self, method: Any, factor: float, step: float, parts: Parting) -> None:
         """Use a method at this factor of its limit, where it makes ``step`` and parts so far."""
         self._limit, self._step, self._parts = method, step, parts
         self._set(factor)

@@ -9,24 +9,20 @@ from __future__ import annotations
 
 import copy
 import ctypes
-import warnings
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from ufl.algorithms import expand_derivatives
-from ufl.classes import Zero
 
-from complexbody import _compat, boundary, coercivity, native
+from complexbody import _compat, boundary, native
 from complexbody.action import Action
+from complexbody.assumptions import check_energy, hessian_samples
 from complexbody.body import Body
 from complexbody.convexity import Convexity, Range
 from complexbody.discretisation import Discretisation
-from complexbody.errors import CoercivityError, agree
 from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
@@ -83,7 +79,7 @@ class Problem:
         self.quiet = True
         self.known_steps: dict[str, Array] = {}
         self.arrange()
-        self.warnings = self._check_energy()
+        self.warnings = check_energy(self)
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
         self.full: Problem = self
         if reduce:
@@ -249,100 +245,8 @@ class Problem:
         return rates
 
     def hessian_samples(self, number: int) -> Array:
-        """H of ρe of region ``number`` at its distinct coefficients, shape (samples, 4n, 4n).
-
-        A density that is not quadratic gives no sample: its Hessian depends on the state.
-        """
-        n = self.disc.n
-        stored, d = self.kernels.densities.stored[number], self.kernels.densities
-        if stored is None or not (d.generated[number] or not stored.expressions()):
-            return np.zeros((0, 4 * n, 4 * n))
-        samples = np.zeros((1, len(d.coefficients)))
-        if stored.expressions():
-            blocks = self.kernels.coefficients[self.disc.region == number]
-            real = self.disc.source_cell[self.disc.region == number] >= 0
-            samples = np.unique(blocks.transpose(0, 2, 1)[real], axis=0)
-        out = np.zeros((len(samples), 4 * n, 4 * n))
-        for (i, j), value in stored.hessian.items():
-            if isinstance(value, float):
-                out[:, i, j] = value
-            else:
-                out[:, i, j] = samples[:, d.coefficients.index(value)]
-        return out
-
-    def _outer_samples(self, number: int) -> Array | None:
-        """∂²(ρw)/∂ν∂ν of region ``number``, shape (samples, k, k); None without a potential.
-
-        Where it depends on the state or on the place: at the initial one, at the cells' vertices.
-        """
-        scene, k, w = self.scene, self.scene.descriptor, self.kernels.densities.potential[number]
-        body, first = scene.bodies[number], 3 * self.disc.n + scene.displacement
-        if body.potential is None:
-            return None
-        if w is not None and not w.expressions():
-            own = np.zeros((1, k, k))
-            for (i, j), value in w.hessian.items():
-                if min(i, j) >= first:
-                    own[0, i - first, j - first] = value
-            return own
-        q = fem.Function(self.action.space)
-        self.disc.scatter(self.initial_fields, q)
-        u, nu = self.action.fields(q)[:2]
-        nu = ufl.variable(nu)
-        second = expand_derivatives(ufl.diff(ufl.diff(body.potential(u, nu), nu), nu))
-        if isinstance(second, Zero):  # which FFCx does not compile
-            return None
-        entries = ufl.as_vector([second[i, j] for i in range(k) for j in range(k)])
-        compiled = _compat.expression(entries, _compat.vertex_space(scene.mesh))
-        cells = np.flatnonzero(scene.regions() == number).astype(np.int32)
-        return _compat.evaluate(compiled, scene.mesh, cells).reshape(-1, k, k)
-
-    def _check_energy(self) -> list[str]:
-        """A1 and locking of every quadratic region; what is found is told on rank 0."""
-        notes: list[str] = []
-        for r, body in enumerate(self.scene.bodies):
-            samples, shape = self.hessian_samples(r), (self.scene.displacement, self.disc.dim)
-            ratio = coercivity.locking_ratio(samples, *shape)
-            ratio = self.comm.allreduce(ratio, op=MPI.MAX)
-            # Coefficients differ between ranks, and so may what they leave free.
-            modes = self._null_modes(r, samples)
-            if any(self.comm.allgather(bool(modes))):
-                modes = self._null_modes(r, samples, self._outer_samples(r))
-            every = [mode for part in self.comm.allgather(modes) for mode in part]
-            notes += [
-                f"The energy of {body.name} does not see the mode {mode}: only inertia, supports "
-                "or loads hold it."
-                for mode in dict.fromkeys(every)
-            ]
-            if ratio >= coercivity.LOCKING:
-                notes.append(
-                    f"The energy of {body.name} is nearly incompressible: volume changes cost as "
-                    f"much as with λ/μ = {ratio:.3g}, and P1 cells lock from about "
-                    f"{coercivity.LOCKING:g} on: shear and bending come out too stiff. Use a "
-                    "smaller bulk modulus, or refine until results stay."
-                )
-        if self.comm.rank == 0:
-            for note in notes:
-                warnings.warn(note, UserWarning, stacklevel=2)
-        return notes
-
-    def _null_modes(self, number: int, samples: Array, outer: Array | None = None) -> list[str]:
-        """Null modes of a region on this rank, in words; collective.
-
-        Raises:
-            CoercivityError: on all ranks if it is not coercive on one.
-        """
-        scene, error, modes = self.scene, None, []
-        name = scene.bodies[number].name
-        try:
-            if len(samples):
-                modes = coercivity.check_coercive(
-                    samples, scene.displacement, scene.descriptor, self.disc.dim, name, outer
-                )
-        except CoercivityError as found:
-            error = found
-        agree(self.comm, error)
-        return modes
+        """H of ρe of region ``number``: see :func:`complexbody.assumptions.hessian_samples`."""
+        return hessian_samples(self, number)
 
     def load_forces(self, amplitude: Array) -> None:
         """f += loads with the given factors per group (partial, before the halo's sum)."""
