@@ -25,7 +25,9 @@ import numpy.typing as npt
 
 from complexbody.errors import ComplexBodyError, MissingPackage
 
-FLAGS = ("-O3", "-march=native", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math",
+#: Kernels are for speed; who compiles many for a few steps each, as tests do, may ask for less.
+OPTIMISATION = os.environ.get("COMPLEXBODY_OPTIMISATION") or "-O3"
+FLAGS = (OPTIMISATION, "-march=native", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math",
          "-ffp-contract=fast", "-fPIC", "-shared", "-Wall", "-Wno-psabi")  # fmt: skip
 
 
