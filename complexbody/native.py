@@ -26,8 +26,9 @@ import numpy.typing as npt
 from complexbody.errors import ComplexBodyError, MissingPackage
 
 #: Kernels are for speed; who compiles many for a few steps each, as tests do, may ask for less.
-OPTIMISATION = os.environ.get("COMPLEXBODY_OPTIMISATION") or "-O3"
-FLAGS = (OPTIMISATION, "-march=native", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math",
+FULL = "-O3"
+OPTIMISATION = os.environ.get("COMPLEXBODY_OPTIMISATION") or FULL
+FLAGS = ("-march=native", "-std=gnu11", "-fno-math-errno", "-fno-trapping-math",
          "-ffp-contract=fast", "-fPIC", "-shared", "-Wall", "-Wno-psabi")  # fmt: skip
 
 
@@ -76,8 +77,12 @@ def compiler() -> tuple[str, str]:
 
 
 @functools.cache
-def load(source: str) -> ctypes.CDLL:
+def load(source: str, optimisation: str = OPTIMISATION) -> ctypes.CDLL:
     """Compile ``source`` if no library of the same content is cached, and load it.
+
+    Args:
+        source: C.
+        optimisation: The compiler's option; ``FULL`` for what all scenes share.
 
     Safe when many processes ask at once: each compiles under a name of its own and renames.
 
@@ -86,12 +91,13 @@ def load(source: str) -> ctypes.CDLL:
         ComplexBodyError: if the compiler fails, with its first messages.
     """
     path, version = compiler()
-    key = "\n".join([source, *FLAGS, version, platform.machine(), *sorted(cpu_flags())])
+    flags = (optimisation, *FLAGS)
+    key = "\n".join([source, *flags, version, platform.machine(), *sorted(cpu_flags())])
     digest = hashlib.sha256(key.encode()).hexdigest()[:24]
     folder = _writable(cache_folder())
     library = folder / f"kernel-{digest}.so"
     if not library.exists():
-        _compile(path, source, library)
+        _compile(path, source, optimisation, library)
     return ctypes.CDLL(str(library))
 
 
@@ -108,12 +114,12 @@ def _writable(folder: Path) -> Path:
     return fallback
 
 
-def _compile(path: str, source: str, library: Path) -> None:
+def _compile(path: str, source: str, optimisation: str, library: Path) -> None:
     with tempfile.TemporaryDirectory(dir=library.parent) as scratch:
         c_file, so_file = Path(scratch) / "kernel.c", Path(scratch) / "kernel.so"
         c_file.write_text(source)
         done = subprocess.run(
-            [path, *FLAGS, "-o", str(so_file), str(c_file), "-lm"],
+            [path, optimisation, *FLAGS, "-o", str(so_file), str(c_file), "-lm"],
             capture_output=True, text=True, check=False, env=dict(os.environ),
         )  # fmt: skip
         if done.returncode != 0:

@@ -38,7 +38,7 @@ def _library(lanes: int, dim: int) -> CDLL:
     folder = Path(__file__).parent
     source = [f"#define W {lanes}", f"#define NR {lanes}", f"#define DIM {dim}"]
     source += [(folder / name).read_text() for name in ("vectors.h", "pencil.c")]
-    return native.load("\n".join(source))
+    return native.load("\n".join(source), native.FULL)
 
 
 def quadratic_eigenvalues(
