@@ -115,8 +115,11 @@ class PeerRun:
             self.steps += 1
 
     def _step(self) -> str:
-        """Bring q (with its ghosts) and v to the end of a step; why not, in words."""
-        raise NotImplementedError
+        """Bring q (with its ghosts) and v to the end of a step; why not, in words.
+
+        Of runs that leave ``advance`` as it is.
+        """
+        return f"{type(self).__name__} has no step of its own"
 
     @cached_property
     def inverse_mass(self) -> Blocks:
