@@ -35,8 +35,11 @@ def invariant_axes(problem: Problem) -> list[int]:
         return []
     found = []
     for axis in range(dim):
-        mine = _prism(problem, axis) and _data(problem, axis) and _ends(problem, axis)
-        if problem.comm.allreduce(bool(mine), op=MPI.LAND):
+        # Ranks see different nodes: each answer is made common before the next question.
+        for question in (_prism, _data, _ends):
+            if not problem.comm.allreduce(bool(question(problem, axis)), op=MPI.LAND):
+                break
+        else:
             found.append(axis)
     return found
 
