@@ -144,9 +144,8 @@ def _ends(problem: Problem, axis: int) -> bool:
     for end in (low, high):
         # Held at an end where sides are not: that bends a free component.
         there = np.abs(x - end) < tiny
-        sides = np.any(fixed[there], axis=0)
-        some |= sides & ~np.any(fixed[~there], axis=0)
-    some = _over_ranks(comm, some, MPI.MAX)
+        at, off = (_over_ranks(comm, np.any(fixed[i], axis=0), MPI.MAX) for i in (there, ~there))
+        some |= at & ~off
     if np.any(some & ~held):
         return False
     # What starts or is driven is no field that stays zero.
