@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -167,7 +168,8 @@ def _jacobi(G: Complex) -> tuple[Complex, Array]:
 def _damped(K: Complex, D: Array, heavy: int) -> tuple[Complex, Complex]:
     """All finite ω of (K − iωD − ω² diag(1, …, 0)) a = 0."""
     n, h = len(K), heavy
-    K = K if np.abs(K.imag).max() > 0 else K.real  # roots of real matrices come in pairs
+    if not K.imag.any():
+        K = cast(Complex, K.real)  # roots of real matrices come in pairs
     rates = np.zeros((n + h, n + h), K.dtype)  # of the state (a, ȧ of what has inertia)
     light = -np.linalg.solve(D[h:, h:], np.concatenate([K[h:], D[h:, :h]], axis=1))
     rates[:h, n:] = np.eye(h)

@@ -11,6 +11,7 @@ from complexbody.forms.bubbly import (
     bubbly_liquid,
     minnaert,
 )
+from complexbody.forms.cosserat import cosserat, cosserat_constants, plane_cosserat
 from complexbody.forms.decagonal import decagonal_quasicrystal
 from complexbody.forms.hexagonal import hexagonal_quasicrystal
 from complexbody.forms.icosahedral import (
@@ -18,6 +19,9 @@ from complexbody.forms.icosahedral import (
     phason_moduli,
     scaled_icosahedral_quasicrystal,
 )
+from complexbody.forms.microcracked import microcracked
+from complexbody.forms.micromorphic import micromorphic, mindlin_bar
+from complexbody.forms.nematic import nematic_director, nematic_elastomer
 from complexbody.forms.two_field import isotropic_two_field
 from complexbody.forms.voids import elastic_voids
 
@@ -25,12 +29,20 @@ __all__ = [
     "bubbly_branches",
     "bubbly_dispersion",
     "bubbly_liquid",
+    "cosserat",
+    "cosserat_constants",
     "decagonal_quasicrystal",
     "elastic_voids",
     "hexagonal_quasicrystal",
     "icosahedral_quasicrystal",
     "isotropic_two_field",
+    "microcracked",
+    "micromorphic",
+    "mindlin_bar",
     "minnaert",
+    "nematic_director",
+    "nematic_elastomer",
     "phason_moduli",
+    "plane_cosserat",
     "scaled_icosahedral_quasicrystal",
 ]
