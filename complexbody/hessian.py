@@ -223,6 +223,8 @@ class _Reader:
             raise NotQuadratic
         operands = [ufl.as_ufl(a.get((), 0.0)) for a in arguments]
         value = e._ufl_expr_reconstruct_(*operands)
+        if isinstance(value, uc.Zero):  # which is no ScalarValue
+            return {}
         return _constant(float(value)) if isinstance(value, uc.ScalarValue) else {(): value}
 
 

@@ -50,7 +50,8 @@ def lattice_masses(body, size):
 def lattice_step(body, size, q, h, scheme="exact"):
     """The map of (a, ȧ of what has inertia) at t to that at t + h; which components have inertia.
 
-    Of any step but the first, in which what has no inertia goes half as far. A plane wave Re(a e^{iq·x}) stays one, and its a is stepped as if it were a body of one node.
+    Of any step but the first, in which what has no inertia goes half as far. A plane wave
+    Re(a e^{iq·x}) stays one, and its a is stepped as if it were a body of one node.
     """
     K = lattice_stiffness(body, size, q, False)
     M, D = lattice_masses(body, size)
