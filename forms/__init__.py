@@ -2,7 +2,8 @@
 """Families of complex bodies, one file each: formula, constants with units and sources, limits.
 
 Each function returns a :class:`complexbody.body.Body` or raises a
-:class:`~complexbody.errors.BodyError` that names the inequality its constants break.
+:class:`~complexbody.errors.BodyError` that names the inequality its constants break. Of each,
+``body.dispersion(q)`` has the plane waves, ``body.scales(cell, size)`` the times of the fields.
 """
 
 from complexbody.forms.bubbly import (

@@ -9,9 +9,8 @@ With ε = sym ∇u and r = ½ curl u,
           + \beta\,\varphi_{i,j}\varphi_{j,i} + \gamma|\nabla\varphi|^2],
           \qquad \chi = \tfrac12\rho j|\dot\varphi|^2,
 
-Eringen's constants. With Lakes' technical ones (:func:`cosserat_constants`) G = μ + κ/2,
-ν = λ/(2λ + 2μ + κ), N² = κ/(2(μ + κ)), l_t² = (β + γ)/(2μ + κ), l_b² = γ/(2(2μ + κ)) and
-Ψ = (β + γ)/(α + β + γ).
+Eringen's constants. Lakes' technical ones (:func:`cosserat_constants`): G = μ + κ/2,
+ν = λ/(2λ + 2G), N² = κ/(2(μ + κ)), l_t² = (β + γ)/(2G), l_b² = γ/(4G), Ψ = (β + γ)/(α + β + γ).
 
 Coercive on (sym U, r − φ, ∇φ) iff 3λ + 2μ + κ, 2μ + κ, κ, 3α + β + γ, γ + β, γ − β > 0. Ψ = 3/2,
 which foams often suggest, is 3α + β + γ = 0: accepted, but semidefinite. ∇φ ∝ I then costs nothing;
@@ -22,8 +21,7 @@ Waves along q: longitudinal ω² = (λ + 2μ + κ)q²/ρ; microrotation along q
 
 .. math:: (\rho\omega^2 - (\mu + \kappa)q^2)(\rho j\omega^2 - \gamma q^2 - 2\kappa) = \kappa^2q^2.
 
-φ has the cut-off √(2κ/(ρj)). Sources: Eringen 1966, 1999; constants of the foam (r), recalled, not
-re-read: Lakes, Int. J. Solids Struct. 22 (1986) 55.
+φ has the cut-off √(2κ/(ρj)). Sources: Eringen 1966; foam (r), recalled, not re-read: Lakes 1986.
 """
 
 from __future__ import annotations
@@ -38,8 +36,8 @@ from complexbody.forms._admissible import Energy, finite, require
 
 
 def _energy(
-    n_u: int, k: int, lam: float, mu: float, kappa: float, gamma: float, alpha: float = 0.0,
-    beta: float = 0.0,
+    n_u: int, k: int, lam: float, mu: float, kappa: float, gamma: float, alpha: float = 0,
+    beta: float = 0,
 ) -> Energy:  # fmt: skip
     """The energy above as ``f(U, nu, N)``; what u has not is zero, and with k = 1 φ = φ e3."""
 
@@ -64,18 +62,18 @@ def cosserat_constants(
     G: float = 104e6, poisson: float = 0.4, N2: float = 0.04, l_t: float = 0.62e-3,
     l_b: float = 0.327e-3, Psi: float = 1.5,
 ) -> dict[str, float]:  # fmt: skip
-    """λ, μ, κ [Pa], α, β, γ [N] of Lakes' technical constants; his dense polyurethane foam's (r).
+    """λ, μ, κ [Pa], α, β, γ [N] of Lakes' technical constants, by default of dense polyurethane.
 
-    G is in Pa, ``l_t`` and ``l_b`` in m; ``poisson``, ``N2`` and ``Psi`` are numbers.
+    Those are recalled (r) from Int. J. Solids Struct. 22 (1986) 55. G is in Pa, l_t and l_b in m.
 
     Raises:
-        BodyError: unless all are finite, ν < ½, 0 < N² < ½ and 0 < Ψ ≤ 3/2.
+        BodyError: unless all are finite, ν < ½, 0 < N² < 1 and 0 < Ψ ≤ 3/2.
     """
     given = {"G": G, "poisson": poisson, "N2": N2, "l_t": l_t, "l_b": l_b, "Psi": Psi}
     finite("cosserat_constants", given)
-    if not (poisson < 0.5 and 0 < N2 < 0.5 and 0 < Psi <= 1.5):
-        advice = "Give poisson < 0.5, 0 < N2 < 0.5 and 0 < Psi <= 1.5."
-        raise BodyError(f"cosserat_constants: no body has {given}. {advice}")
+    if not (poisson < 0.5 and 0 < N2 < 1 and 0 < Psi <= 1.5):
+        raise BodyError(f"cosserat_constants: no body has {given}. Give poisson < 0.5, 0 < N2 < 1 "
+                        "and 0 < Psi <= 1.5.")  # fmt: skip
     kappa, twist, gamma = 2 * N2 * G / (1 - N2), 2 * G * l_t**2, 4 * G * l_b**2
     lam, alpha = 2 * G * poisson / (1 - 2 * poisson), twist / Psi - twist
     return {"lam": lam, "mu": G - kappa / 2, "kappa": kappa,
@@ -86,21 +84,20 @@ _FOAM = cosserat_constants()
 
 
 def _stiff(family: str, bulk: int, c: dict[str, float]) -> None:
-    """What the plane and space ask alike: of strain in ``bulk`` dimensions, and of κ."""
+    """Of strain in ``bulk`` dimensions, and of κ."""
     require(family, "kappa > 0", c["kappa"], 0.0, "Choose a larger kappa.")
     shear = 2 * c["mu"] + c["kappa"]
     require(family, "2*mu + kappa > 0", shear, 0.0, "Choose a larger mu.")
-    left = bulk * c["lam"] + shear
-    require(family, f"{bulk}*lam + 2*mu + kappa > 0", left, 0.0, "Choose a larger lam.")
+    volume, condition = bulk * c["lam"] + shear, f"{bulk}*lam + 2*mu + kappa > 0"
+    require(family, condition, volume, 0.0, "Choose a larger lam.")
 
 
 def cosserat(
     lam: float = _FOAM["lam"], mu: float = _FOAM["mu"], kappa: float = _FOAM["kappa"],
     alpha: float = _FOAM["alpha"], beta: float = _FOAM["beta"], gamma: float = _FOAM["gamma"],
     density: float = 340.0, micro_inertia: float = 1e-8, viscosity: float = 0.0,
-    name: str = "Cosserat body",
 ) -> Body:  # fmt: skip
-    """Cosserat body (``displacement=3``, ``descriptor=3``), by default Lakes' foam, Ψ = 3/2.
+    """Cosserat body (``displacement=3``, ``descriptor=3``), by default Lakes' foam.
 
     Args:
         lam: λ [Pa].
@@ -112,24 +109,23 @@ def cosserat(
         density: ρ [kg/m³]; the foam's (r).
         micro_inertia: j [m²]; not measured: (0.1 mm)², about a cell of the foam squared.
         viscosity: η of φ [Pa·s].
-        name: What to call it.
 
     Raises:
         CoercivityError: unless the inequalities above hold; 3α + β + γ = 0 is accepted.
         BodyError: for constants that are not finite numbers, or masses no body can have.
     """
-    family, larger = "cosserat", "Choose a larger gamma."
-    c = finite(family, {"lam": lam, "mu": mu, "kappa": kappa,
-                        "alpha": alpha, "beta": beta, "gamma": gamma})  # fmt: skip
+    family, more = "cosserat", "Choose a larger gamma."
+    given = {"lam": lam, "mu": mu, "kappa": kappa, "gamma": gamma}
+    c = finite(family, given | {"alpha": alpha, "beta": beta})
     _stiff(family, 3, c)
-    require(family, "gamma + beta > 0", gamma + beta, 0.0, larger)
-    require(family, "gamma - beta > 0", gamma - beta, 0.0, larger)
+    require(family, "gamma + beta > 0", gamma + beta, 0.0, more)
+    require(family, "gamma - beta > 0", gamma - beta, 0.0, more)
     polar = 3 * alpha + beta + gamma
     polar = 0.0 if abs(polar) < 1e-12 * gamma else polar  # Ψ = 3/2 but for round-off
     remedy = "Choose a larger alpha: Psi is at most 3/2."
     require(family, "3*alpha + beta + gamma >= 0", polar, 0.0, remedy, strict=False)
     inertia = density * finite(family, {"j": micro_inertia})["j"]
-    return Body(3, _energy(3, 3, **c), density, inertia, viscosity, name=name, constants=c)
+    return Body(3, _energy(3, 3, **c), density, inertia, viscosity, name=family, constants=c)
 
 
 def plane_cosserat(
@@ -137,9 +133,9 @@ def plane_cosserat(
     gamma: float = _FOAM["gamma"], density: float = 340.0, micro_inertia: float = 1e-8,
     viscosity: float = 0.0, d: int = 2,
 ) -> Body:  # fmt: skip
-    """Plane strain of :func:`cosserat`: φ = φ e3 (``displacement=d``, ``descriptor=1``).
+    """Plane strain of :func:`cosserat`, φ = φ e3 (``displacement=d``, ``descriptor=1``).
 
-    Constants are those of :func:`cosserat`; d is 2, or 3 for a u3 that moves while φ1 = φ2 = 0.
+    d is 2, or 3 for a u3 that moves while φ1 = φ2 = 0.
 
     Raises:
         CoercivityError: unless 2λ + 2μ + κ, 2μ + κ, κ, γ > 0.
@@ -152,5 +148,5 @@ def plane_cosserat(
     _stiff(family, 2, c)
     require(family, "gamma > 0", gamma, 0.0, "Choose a larger gamma.")
     inertia = density * finite(family, {"j": micro_inertia})["j"]
-    return Body(1, _energy(d, 1, **c), density, inertia, viscosity, displacement=d,
-                name="Cosserat body, plane", constants=c)  # fmt: skip
+    energy = _energy(d, 1, **c)
+    return Body(1, energy, density, inertia, viscosity, displacement=d, name=family, constants=c)
