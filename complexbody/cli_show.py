@@ -142,8 +142,8 @@ def _look(a: argparse.Namespace) -> Look:
         size = (int(parts[0]), int(parts[1]))
     warp = a.warp if a.warp == "auto" else _numbers("--warp", a.warp)[0]
     return Look(
-        components, warp, limits, a.colormap, view, clip, size, units=not a.no_units  # type: ignore[arg-type]
-    )
+        components, warp, limits, a.colormap, view, clip, size, units=not a.no_units
+    )  # fmt: skip
 
 
 def _numbers(option: str, text: str) -> list[float]:

@@ -50,12 +50,12 @@ def write_ledger(path: Path, columns: Mapping[str, Array], title: str, units: bo
     upper.plot(time, total / scale, color="black", lw=2.0, label="total of the body")
     upper.set_ylabel(f"energy{unit}")
     upper.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    books = {
-        "balance": ("of the energy balance", "#D55E00", np.abs(columns["balance"]) / (largest or 1)),
-        "identity": ("of the discrete identity", "#0072B2", np.abs(columns["identity"])),
-    }  # fmt: skip
+    balance, identity = np.abs(columns["balance"]) / (largest or 1), np.abs(columns["identity"])
     told = False
-    for said, colour, error in books.values():
+    for said, colour, error in (
+        ("of the energy balance", "#D55E00", balance),
+        ("of the discrete identity", "#0072B2", identity),
+    ):
         if error.any():
             told = True
             lower.semilogy(time, np.where(error > 0, error, np.nan), color=colour, lw=1.2,
@@ -96,7 +96,7 @@ def write_probes(
     everything = [columns for columns in probes.values()]
     time_scale, _ = _time(np.concatenate([columns["time"] for columns in everything]), units, False)
     colours = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"]
-    colours += [matplotlib.colors.to_hex(c) for c in matplotlib.colormaps["tab20"].colors]
+    colours += [matplotlib.colors.to_hex(matplotlib.colormaps["tab20"](i)) for i in range(20)]
     for column, (start, name, base) in enumerate((("u", "u", "m"), ("nu", r"\nu", ""))):
         members = [n for n in everything[0] if n.removeprefix(start).isdigit()]
         largest = max((np.abs(c[n]).max() for c in everything for n in members), default=0.0)

@@ -20,7 +20,7 @@ from complexbody._compat import Array
 from complexbody.rendering import View, image
 from complexbody.scales import SYMBOLS, Panel, Shown, Visible, prefixed
 
-__all__ = ["Drawing", "Frame", "Panel", "Visible", "draw", "displacement", "factor_of"]
+__all__ = ["Drawing", "Frame", "Panel", "Visible", "displacement", "draw", "factor_of"]
 
 WIDTH, DPI = 10.0, 160  # inches and pixels per inch
 STYLE = {"font.size": 11.0, "axes.linewidth": 0.6, "axes.edgecolor": "0.4"}
@@ -119,10 +119,11 @@ class Drawing:
 
     def pixels(self) -> Any:
         """Colours from the top, shape (height, width, 3), of type uint8."""
-        self._canvas.draw()
+        canvas: Any = self._canvas
+        canvas.draw()
         # Layout takes longer than all else, and must not move from frame to frame.
         self._figure.set_layout_engine("none")
-        return np.asarray(self._canvas.buffer_rgba())[:, :, :3].copy()
+        return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
 
 
 class _Lines:
@@ -182,7 +183,7 @@ class _Views:
     ) -> None:
         names = dict.fromkeys(panel.warp or "" for panel in panels)
         self._factors = {
-            name: frame.factors.get(name) if name in frame.factors else factor_of(body, name)
+            name: frame.factors[name] if name in frame.factors else factor_of(body, name)
             for name in names
         }  # fmt: skip
         self._panels = panels
@@ -195,7 +196,7 @@ class _Views:
         rows = len(panels) // columns
         width = WIDTH / columns - (1.9 if body.dim == 2 else 1.3)
         height = min(width * view.aspect, 6.5)
-        self._pixels = round(frame.oversampling * DPI * height)
+        self._pixels = round(frame.oversampling * figure.dpi * height)
         figure.set_size_inches(WIDTH, rows * (height + (0.7 if body.dim == 2 else 0.2)) + 0.8)
         figure.set_layout_engine("compressed")
         scale, prefix = prefixed(float(np.ptp(body.points, axis=0).max()), frame.length)
@@ -217,7 +218,7 @@ class _Views:
                 ax.set_axis_off()
             colour_bar(figure, ax.inset_axes((1.03, 0.0, 0.18 / width, 1.0)), shown)
         if body.dim == 3:
-            axes_cross(axes[0], view.screen)
+            axes_cross(axes[-1], view.screen)
         self.caption = caption(body, self._factors, scale, prefix + frame.length)
 
     def _places(self, body: Visible, panel: Panel) -> Array:

@@ -34,6 +34,11 @@ def ffmpeg() -> str | None:
     return found
 
 
+def kind_of(wanted: str) -> str:
+    """The kind of film: "auto" is mp4 where there is ffmpeg, else gif."""
+    return ("mp4" if ffmpeg() else "gif") if wanted == "auto" else wanted
+
+
 def require_movie(kind: str) -> None:
     """See that a film of this kind can be made.
 

@@ -159,18 +159,19 @@ def _dataset(path: Path, place: str) -> Any:
             break
         except (OSError, RuntimeError) as error:  # perhaps it is just being written
             problem = error
-    raise ResultsError(f"{path}:{place} cannot be read ({problem}). Run the scene again.")
+    raise ResultsError(
+        f"{path}:{place} cannot be read ({problem}). Wait for the run to write it, or run the "
+        "scene again."
+    )
 
 
 def _grids(path: Path) -> dict[str, list[tuple[float, Any, Any]]]:
     """Of each attribute in an index, its grids; of an index that is cut off, the whole ones."""
-    root: Any = None
     whole: list[Any] = []
-    parser = ElementTree.XMLPullParser(("start", "end"))
+    parser: Any = ElementTree.XMLPullParser(("start", "end"))
     try:
         parser.feed(path.read_text(encoding="utf-8"))
         for event, element in parser.read_events():
-            root = element if root is None else root
             if event == "end" and element.tag == "Grid" and not element.findall("Grid"):
                 whole.append(element)
     except ElementTree.ParseError:

@@ -53,7 +53,7 @@ class Look:
 
     components: Sequence[int | str] | None = None
     warp: float | str = "auto"
-    limits: tuple[float, float] | float | None = None
+    limits: Sequence[float] | float | None = None
     colours: str | None = None
     view: str | Sequence[float] | None = None
     clip: tuple[str, float] | None = None
@@ -63,21 +63,14 @@ class Look:
     def __post_init__(self) -> None:
         if self.warp != "auto" and not (_is_number(self.warp) and float(self.warp) >= 0):
             raise ResultsError(f"Show: warp is {self.warp!r}. Give 'auto', or a factor ≥ 0.")
-        if isinstance(self.limits, tuple | list):
+        if isinstance(self.limits, Sequence):
+            object.__setattr__(self, "limits", tuple(self.limits))
             if len(self.limits) != 2 or not all(map(_is_number, self.limits)) or (
                 self.limits[0] >= self.limits[1]
             ):
                 raise ResultsError(f"Show: limits are {self.limits!r}. Give two rising numbers.")
         elif self.limits is not None and not 0 < self.limits <= 100:
             raise ResultsError(f"Show: limits={self.limits!r}. Give a percentage up to 100.")
-        if self.colours is not None:
-            import matplotlib
-
-            if self.colours not in matplotlib.colormaps:
-                raise ResultsError(
-                    f"Show: matplotlib has no colour map {self.colours!r}. Give one such as "
-                    "viridis, inferno, coolwarm or RdBu_r."
-                )
         if self.clip is not None and (
             self.clip[0] not in ("x", "y", "z") or not _is_number(self.clip[1])
         ):
@@ -130,6 +123,13 @@ class Reel:
     def __init__(
         self, results: Results, name: str, times: Sequence[float] | None, look: Look, every: int = 0
     ) -> None:
+        import matplotlib
+
+        if look.colours is not None and look.colours not in matplotlib.colormaps:
+            raise ResultsError(
+                f"Show: matplotlib has no colour map {look.colours!r}. Give one such as viridis, "
+                "inferno, coolwarm or RdBu_r."
+            )
         self.series: Series = results.series(name)
         series, count = self.series, self.series.values(-1).shape[1]
         self.steps = self._chosen(times, every)
@@ -152,9 +152,9 @@ class Reel:
         panel = Panel(
             name, None, None if self._u is None else "u",
             unit=None if look.units else "", colours=look.colours,
-            limits=tuple(look.limits) if isinstance(look.limits, tuple | list) else None,
+            limits=(look.limits[0], look.limits[1]) if isinstance(look.limits, Sequence) else None,
         )  # fmt: skip
-        panels = [replace(panel, component=component) for component in look.components or [None]]
+        panels = [replace(panel, component=c) for c in look.components or ()] or [panel]
         shown = series.times[self.steps]
         self.stamps = (
             [""] if name in STEP_FIELDS else stamps(shown.tolist(), "s" if look.units else "")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -63,7 +64,7 @@ class View:
     high: Array
 
     @classmethod
-    def of(cls, points: Array, solid: bool, eye: Array | None = None) -> View:
+    def of(cls, points: Array, solid: bool, eye: Sequence[float] | None = None) -> View:
         """A frame around points (points, 3).
 
         Args:
@@ -163,7 +164,7 @@ def image(
     edges = still.extract_feature_edges(
         feature_angle=35,
         boundary_edges=True,
-        feature_edges=True,  # flat bodies have none
+        feature_edges=bool(np.ptp(rest[:, 2]) > 0),  # faces of flat bodies look either way
         manifold_edges=False,
         non_manifold_edges=False,
     )

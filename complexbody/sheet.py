@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""All fields of a run on one page: a row per field, at several times or, in one dimension, over all.
+"""All fields of a run on one page: a row each, at several times or, in one dimension, over all.
 
 One-dimensional fields become space–time diagrams, in which waves are straight lines.
 """

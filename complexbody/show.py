@@ -17,7 +17,7 @@ from mpi4py import MPI
 from complexbody.curves import write_ledger, write_probes
 from complexbody.errors import ResultsError
 from complexbody.files import on_first_rank
-from complexbody.movie import KINDS, ffmpeg, require_movie, write_movie
+from complexbody.movie import KINDS, kind_of, require_movie, write_movie
 from complexbody.output import STEP_FIELDS
 from complexbody.picture import require_tools
 from complexbody.progress import counted
@@ -161,7 +161,7 @@ class _Maker:
         for name in self._names(names):
             require_tools(self._results.series(name).dim)
         if animate is not None:
-            require_movie(_kind(animate))
+            require_movie(kind_of(animate))
 
     def _file(self, name: str) -> Path:
         self._out.mkdir(parents=True, exist_ok=True)
@@ -185,7 +185,7 @@ class _Maker:
         self, names: Sequence[str] | None, times: Any, every: int, animate: str, fps: float
     ) -> None:
         """A film of each field; colours and frame are those of all its pictures."""
-        kind, look = _kind(animate), self._look
+        kind, look = kind_of(animate), self._look
         if kind == "gif" and look.size is None:
             look = replace(look, size=_GIF)
         names = [n for n in self._names(names) if names is not None or n not in STEP_FIELDS]
@@ -217,7 +217,8 @@ class _Maker:
                     continue  # a time is no diagram
             else:
                 wanted = series.times[np.unique(np.linspace(0, last, ACROSS + 1).astype(int)[1:])]
-            reels.append(Reel(self._results, name, wanted if times is None else times, look))
+            moments = wanted.tolist() if times is None else times
+            reels.append(Reel(self._results, name, moments, look))
         if reels:
             path = self._file("sheet.png")
             write_sheet(path, reels, self._results.title)
@@ -244,7 +245,3 @@ class _Maker:
         path = self._file("probes.png")
         write_probes(path, found, points, self._results.title, self._look.units)
         self._done(path, ", ".join(found))
-
-
-def _kind(animate: str) -> str:
-    return ("mp4" if ffmpeg() else "gif") if animate == "auto" else animate

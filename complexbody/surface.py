@@ -90,11 +90,12 @@ class Surface:
             (grid.cell_data if per_cell else grid.point_data)[name] = table
         # Values at points of the plane are those of P1 there.
         cut = self._extracted(grid.clip(normal=self._normal, origin=self._origin))
-        values = {
-            name: np.asarray((cut.cell_data if per_cell else cut.point_data)[name]).reshape(
-                cut.n_cells if per_cell else cut.n_points, -1
-            )
-            for name, (_, per_cell) in fields.items()
-        }
+        cut = cut.clean(tolerance=1e-7)  # a plane through nodes makes triangles without an area
         faces = cut.faces.reshape(-1, 4)[:, 1:]
+        values = {}
+        for name, (table, per_cell) in fields.items():
+            data = np.asarray((cut.cell_data if per_cell else cut.point_data)[name])
+            # What is left of such triangles, points and lines, stands before the others.
+            data = data[cut.n_cells - len(faces) :] if per_cell else data
+            values[name] = data.reshape(-1, table.shape[1])
         return Visible(3, np.asarray(cut.points), faces, values, cellwise)
