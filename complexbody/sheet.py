@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from complexbody.drawing import DPI, STYLE, WIDTH, axes_cross, colour_bar, displacement
+from complexbody.drawing import DPI, STYLE, WIDTH, axes_cross, caption, colour_bar, displacement
 from complexbody.reel import Reel
 from complexbody.rendering import image
 from complexbody.scales import Shown, prefixed
@@ -71,6 +71,10 @@ def _images(figure: Any, reels: Sequence[Reel]) -> None:
             if number == len(reel) - 1:
                 bar = ax.inset_axes((1.04, 0.0, 0.1 / width, 1.0))
                 colour_bar(figure, bar, shown)
+    length = reels[0].frame.length
+    scale, prefix = prefixed(float(np.ptp(reels[0].series.points, axis=0).max()), length)
+    said = caption(reels[0].body(0), reels[0].frame.factors, scale, prefix + length)
+    figure.supxlabel(said or " ", fontsize=9.5, color="0.3")
     if reels[0].series.dim == 3:
         axes_cross(axes[-1, -1], views[0].screen)  # the last one: others would be drawn over it
 
