@@ -3,9 +3,9 @@
 
 The plate of demos/graded_crack.py at sizes that a chart can afford: an icosahedral quasicrystal in
 *scaled* units (not a real material, :func:`complexbody.forms.scaled_icosahedral_quasicrystal`),
-struck on its upper edge by a Ricker pulse; the lower one is a plane of symmetry. Few small cells, many large
-ones: one step for all is dictated by the few. There is no exact solution; at the tip the stresses
-are singular, so that errors fall more slowly than by the second power of the cells' size.
+struck on its upper edge by a Ricker pulse; the lower one is a plane of symmetry. Few small cells,
+many large ones: one step for all is dictated by the few. There is no exact solution; at the tip the
+stresses are singular, so that errors fall more slowly than by the second power of the cells' size.
 """
 
 from __future__ import annotations

@@ -3,9 +3,10 @@
 
 An icosahedral quasicrystal in *scaled* units (not a real material,
 :func:`complexbody.forms.scaled_icosahedral_quasicrystal`): u and ν with three components each, the
-full coupling of the two, some viscosity. Struck on the upper edge; the lower
-one is a plane of symmetry, the others are free. Small cells sit all along the tip, through the thickness. The pulse is slow enough for
-meshes of some 10 000 cells to resolve its waves to one per cent; the step is the tip's.
+full coupling of the two, some viscosity. Struck on the upper edge; the lower one is a plane of
+symmetry, the others are free. Small cells sit all along the tip, through the thickness. The pulse
+is slow enough for meshes of some 10 000 cells to resolve its waves to one per cent; the step is the
+tip's.
 """
 
 from __future__ import annotations
