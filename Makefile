@@ -42,8 +42,8 @@ PLATE = --meshes refine=0.3,0.45,0.6
 charts: setup ## speed against accuracy on four scenes (docs/charts), serially, an hour
 	$(call CHART,bar) --meshes cells=100,200,400,800 --steps 5 --budget 3
 	$(call CHART,phason) --meshes cells=20,40,80 --steps 5 --budget 3
-	$(call CHART,notch) $(NOTCH) $(PEERS) 15
-	$(call CHART,notch) $(NOTCH) --steps 5 --budget 4
+	$(call CHART,notch) $(NOTCH) $(PEERS) 60
+	$(call CHART,notch) $(NOTCH) --steps 5 --budget 10
 	$(call CHART,plate) $(PLATE) $(PEERS) 100
 	$(call CHART,plate) $(PLATE) --steps 4 --budget 15
 
