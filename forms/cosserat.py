@@ -50,10 +50,10 @@ def _energy(
         lag = [0.5 * (grad[i, j] - grad[j, i]) - p for (i, j), p in zip(turns, phi, strict=True)]
         e = ufl.sym(grad)
         strain = 0.5 * lam * ufl.tr(e) ** 2 + (mu + 0.5 * kappa) * ufl.inner(e, e)
-        curvature = 0.5 * gamma * ufl.inner(w, w)
+        curvature = gamma * ufl.inner(w, w)
         if k == 3:
-            curvature += 0.5 * alpha * ufl.tr(w) ** 2 + 0.5 * beta * ufl.inner(w, w.T)
-        return strain + kappa * sum(a**2 for a in lag) + curvature
+            curvature += alpha * ufl.tr(w) ** 2 + beta * ufl.inner(w, w.T)
+        return strain + kappa * sum(a**2 for a in lag) + 0.5 * curvature
 
     return energy
 
@@ -72,8 +72,8 @@ def cosserat_constants(
     given = {"G": G, "poisson": poisson, "N2": N2, "l_t": l_t, "l_b": l_b, "Psi": Psi}
     finite("cosserat_constants", given)
     if not (poisson < 0.5 and 0 < N2 < 1 and 0 < Psi <= 1.5):
-        raise BodyError(f"cosserat_constants: no body has {given}. Give poisson < 0.5, 0 < N2 < 1 "
-                        "and 0 < Psi <= 1.5.")  # fmt: skip
+        advice = "Give poisson < 0.5, 0 < N2 < 1 and 0 < Psi <= 1.5."
+        raise BodyError(f"cosserat_constants: no body has {given}. {advice}")
     kappa, twist, gamma = 2 * N2 * G / (1 - N2), 2 * G * l_t**2, 4 * G * l_b**2
     lam, alpha = 2 * G * poisson / (1 - 2 * poisson), twist / Psi - twist
     return {"lam": lam, "mu": G - kappa / 2, "kappa": kappa,
@@ -85,11 +85,11 @@ _FOAM = cosserat_constants()
 
 def _stiff(family: str, bulk: int, c: dict[str, float]) -> None:
     """Of strain in ``bulk`` dimensions, and of κ."""
-    require(family, "kappa > 0", c["kappa"], 0.0, "Choose a larger kappa.")
     shear = 2 * c["mu"] + c["kappa"]
+    require(family, "kappa > 0", c["kappa"], 0.0, "Choose a larger kappa.")
     require(family, "2*mu + kappa > 0", shear, 0.0, "Choose a larger mu.")
-    volume, condition = bulk * c["lam"] + shear, f"{bulk}*lam + 2*mu + kappa > 0"
-    require(family, condition, volume, 0.0, "Choose a larger lam.")
+    condition = f"{bulk}*lam + 2*mu + kappa > 0"
+    require(family, condition, bulk * c["lam"] + shear, 0.0, "Choose a larger lam.")
 
 
 def cosserat(
@@ -120,9 +120,8 @@ def cosserat(
     _stiff(family, 3, c)
     require(family, "gamma + beta > 0", gamma + beta, 0.0, more)
     require(family, "gamma - beta > 0", gamma - beta, 0.0, more)
-    polar = 3 * alpha + beta + gamma
-    polar = 0.0 if abs(polar) < 1e-12 * gamma else polar  # Ψ = 3/2 but for round-off
-    remedy = "Choose a larger alpha: Psi is at most 3/2."
+    polar = 3 * alpha + beta + gamma + 1e-12 * gamma  # Ψ = 3/2 but for round-off
+    remedy = "Choose a larger alpha."
     require(family, "3*alpha + beta + gamma >= 0", polar, 0.0, remedy, strict=False)
     inertia = density * finite(family, {"j": micro_inertia})["j"]
     return Body(3, _energy(3, 3, **c), density, inertia, viscosity, name=family, constants=c)
@@ -133,9 +132,7 @@ def plane_cosserat(
     gamma: float = _FOAM["gamma"], density: float = 340.0, micro_inertia: float = 1e-8,
     viscosity: float = 0.0, d: int = 2,
 ) -> Body:  # fmt: skip
-    """Plane strain of :func:`cosserat`, φ = φ e3 (``displacement=d``, ``descriptor=1``).
-
-    d is 2, or 3 for a u3 that moves while φ1 = φ2 = 0.
+    """Plane strain, φ = φ e3 (k = 1); d = 2, or 3 for a u3 that moves while φ1 = φ2 = 0.
 
     Raises:
         CoercivityError: unless 2λ + 2μ + κ, 2μ + κ, κ, γ > 0.
