@@ -8,6 +8,7 @@ dissipation: variational integrators and convergence* ("the paper" in docstrings
 """
 
 from complexbody.body import Body
+from complexbody.dispersion_picture import plot_dispersion
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
@@ -51,6 +52,7 @@ __all__ = [
     "chart",
     "constant",
     "plan",
+    "plot_dispersion",
     "ramp",
     "realised_speed_up",
     "ricker",
