@@ -30,7 +30,7 @@ def test_programs_run(page, tmp_path, monkeypatch, capsys):
         saved = re.match(r"# file: (\S+)\n", block)
         if saved:  # a file that the reader is told to write
             Path(saved[1]).write_text(block)
-        if ">>>" in block:
+        elif ">>>" in block:
             test = doctest.DocTestParser().get_doctest(block, names, page.name, str(page), number)
             assert doctest.DocTestRunner().run(test, clear_globs=False).failed == 0
             names.update(test.globs)
