@@ -161,7 +161,7 @@ class Body:
         Returns:
             ω [rad/s], shape (…, b) for q of shape (…, m), b = 2(n_u + k) less one for each
             direction of ν without inertia, by real part. With ``polarisations`` also a, shape
-            (…, n_u + k, b): |a| = 1 in the fields' own units, the largest component positive.
+            (…, n_u + k, b): of length 1 in the fields' own units, the largest component positive.
 
         Raises:
             BodyError: for a q or a state that makes no sense, coefficients that vary in space, a

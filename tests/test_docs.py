@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"^```python\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)")
-COMMAND = re.compile(r"^    (?:mpirun -n \d )?\.venv/bin/complexbody (.+?)(?:\s+#.*)?$", re.MULTILINE)
+COMMAND = re.compile(r"^    (?:mpirun .+ )?\.venv/bin/complexbody (.+?)(?:\s+#.*)?$", re.MULTILINE)
 
 pytestmark = pytest.mark.serial
 
