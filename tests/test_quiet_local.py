@@ -88,6 +88,6 @@ def test_moved_by_hand(comm):
     for quiet in (True, False):
         run = prepared(bar(comm, 1, "bump", fine=0.9), LOCAL)
         if not quiet:
-            run.activity.stop()
+            run.wake()
         maps.append(RunMap(run)(np.random.default_rng(0).normal(size=RunMap(run).size)))
     np.testing.assert_array_equal(*maps)
