@@ -37,11 +37,13 @@ SOURCES = {
 }
 
 
-def bar(comm, dim, source, kind="numbers", extra=None, potential=None, fine=0.0, **given):
+def bar(
+    comm, dim, source, kind="numbers", extra=None, potential=None, fine=0.0, inertia=None, **given
+):
     """A long body of two regions at rest, in which one thing happens at an end.
 
     With 0 < ``fine`` < 1 its cells are the finer the nearer to the middle, with −1 < ``fine`` < 0
-    the nearer to the ends.
+    the nearer to the ends. ``inertia`` is a χ(ν, ν̇) in place of that ``kind``.
     """
     if dim == 1:
         mesh = meshes.graded_interval(comm, np.linspace(0.8, 1.2, CELLS[1]) / CELLS[1])
@@ -51,6 +53,7 @@ def bar(comm, dim, source, kind="numbers", extra=None, potential=None, fine=0.0,
         mesh = meshes.jiggled(meshes.box(comm, (0, 0, 0), (1, 0.2, 0.1), CELLS[3]), 0.15)
     x = mesh.geometry.x
     x[:, 0] += fine * np.sin(2 * np.pi * x[:, 0]) / (2 * np.pi)
+    kinds = INERTIA[kind] if inertia is None else ((inertia, 0.3), (inertia, 0.0))
     n_u, k = (3, 3) if dim == 3 else (2, 2)
     base = {
         1: quadratic(random_hessian(10, n_u, k, dim), dim),
@@ -63,7 +66,7 @@ def bar(comm, dim, source, kind="numbers", extra=None, potential=None, fine=0.0,
 
     bodies = {
         1 + r: cb.Body(k, energy, 1.3, *parts, potential, n_u, name=f"region {r}")
-        for r, parts in enumerate(INERTIA[kind])
+        for r, parts in enumerate(kinds)
     }
     return cb.Scene(mesh, bodies, **SOURCES[source](n_u, k), cell_tags=halves(mesh), **given)
 

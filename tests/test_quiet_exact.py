@@ -27,7 +27,9 @@ def short_spans(monkeypatch, small_chunks):  # noqa: F811
     monkeypatch.setattr(exact_schedule, "PER_CELL", 0.3)
 
 
-@pytest.mark.parametrize("dim, fine, spans", [(1, 0.9, 40), (1, -0.9, 30), (2, 0.6, 30), (3, 0.0, 12)])
+@pytest.mark.parametrize("dim, fine, spans", [
+    (1, 0.9, 40), (1, -0.9, 30), (2, 0.6, 30), (3, 0.0, 12),
+])  # fmt: skip
 def test_point_pulse(comm, dim, fine, spans):
     """A pulse that enters at one end pays for what it has reached."""
     assert pair(comm, bar(comm, dim, "traction", fine=fine), EXACT, spans, ledger_steps=7) > 0.2

@@ -61,7 +61,7 @@ class ExactRun(RecordRun):
         self._watch()
 
     def _watch(self) -> None:
-        """Schedule only what motion can reach from now on, if that is not nearly all; collective."""
+        """Schedule only what motion can reach, if that is not nearly all; collective."""
         problem, disc = self.problem, self.problem.disc
         if not problem.quiet:
             return

@@ -237,7 +237,8 @@ def _parts(level: Ints, node: Any, ends: Ints, depth: int) -> tuple[Ints, Ints, 
     """(first, from, range): runs of one level and one range of nodes, of entries by level.
 
     Args:
-        level, node: Of each entry.
+        level: Of each entry.
+        node: Of each entry.
         ends: Where the ranges of nodes end.
         depth: L, the largest level.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Which cells of an exact schedule motion can have reached: no others need be scheduled (reached.c).
+"""Which cells of an exact schedule motion can have reached: others are not scheduled (reached.c).
 
 Who may move whom, and when, is known before anything moves: a cell's event moves all its nodes if
 one of them has begun to move before. Followed to a span's end, cell by cell, that gives the cells

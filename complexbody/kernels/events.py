@@ -51,7 +51,8 @@ def record_size(components: int, record: int, third: bool) -> tuple[int, int, in
     """(doubles per node, slot of its time, slot of 1/volume), as in drifts.h.
 
     Args:
-        components: N; record: NR.
+        components: N.
+        record: NR.
         third: Whether there is more than position and rate.
     """
     parts = 3 if third else 2
