@@ -213,7 +213,7 @@ class Discretisation:
         self.boundary_chunks = int(np.sum(self.chunks[:, 1] <= self.boundary_blocks))
 
     def _runs(self) -> list[int]:
-        change = np.flatnonzero(np.diff(self.region)) + 1
+        change = np.flatnonzero((np.diff(self.region) != 0) | (np.diff(self.group) != 0)) + 1
         return sorted({int(c) for c in change} | {self.boundary_blocks} - {0})
 
     def _volumes(self, regions: int) -> None:

@@ -43,8 +43,7 @@ class RunMap:
     def __init__(self, run: Any, spans: int = 1) -> None:
         self.run, self.spans = run, spans
         problem = run.problem
-        if getattr(run, "activity", None) is not None:
-            run.activity.stop()  # cells at rest are set moving by hand
+        run.wake()  # cells at rest are set moving by hand
         self._rows, self._columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
         self.free = len(self._rows)
         self._held: list[tuple[int, int, Array]] = []

@@ -66,7 +66,8 @@ def simulate(
         progress: Show progress on rank 0; by default where standard error is a terminal.
         plan: Leave out what changes no result (:func:`complexbody.planning.plan`); False: nothing.
         quiet: Skip cells at rest that nothing has reached yet: the same results to the bit
-            (``Synchronous`` and windows of ``AVI``; the others act on all cells).
+            (``Synchronous``, ``LocalLeapfrog``, ``AVI``, and ``Implicit`` with the vertex rule and
+            explicit forces; the others act on all cells).
         accuracy: Relative error to meet at the end, in place of an integrator: the larger one of u
             and ν (L2), over their largest norms (:mod:`complexbody.accuracy`).
 

@@ -49,6 +49,11 @@ class Counted:
     skipped: int = 0
     activity: Activity | None = None
 
+    def wake(self) -> None:
+        """All cells act from now on: for who changes the state by hand."""
+        if self.activity is not None:
+            self.activity.stop()
+
     def _count(self, due: int) -> None:
         """Of so many cell updates that were due, count those done and those skipped."""
         saved = 0 if self.activity is None else self.activity.skipped - self.skipped
@@ -103,7 +108,7 @@ class Activity:
         c.cb_wake(this, ctypes.c_int64(len(rows)), native.pointer(rows))
 
     def stop(self) -> None:
-        """All cells act from now on: for who changes a run's state by hand."""
+        """All cells act from now on."""
         self.state.on = 0
 
     @property

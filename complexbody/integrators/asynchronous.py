@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from complexbody.errors import IntegratorError, StepError, agree
 from complexbody.integrators.exact_run import ExactRun
-from complexbody.integrators.exact_schedule import span_length
+from complexbody.integrators.exact_schedule import alike, span_length
 from complexbody.integrators.stiffened import reach, stiffen
 from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import divisions, graded, window_length
@@ -42,7 +42,8 @@ class AVI:
             0.47 of it on bars of two rates, hence 0.45.
         schedule: "octaves" (N_K = ⌈W/h_K⌉ equal steps per window rounded up to a power of two, and
             until neighbours differ by two at most; the default), "windows" (N_K as it is; the
-            default if not balanced) or "exact" (any real h_K, events at its multiples).
+            default if not balanced) or "exact" (any real h_K, events at its multiples; those not
+            given have 26 binary digits, so that cells alike but for round-off act together).
         balanced: Forces act through the cells' steps, which removes the error floor of asynchronous
             stepping; the default on octaves, and only there. False gives an AVI of the paper with
             rational time sets, symplectic, with the floor. An exact schedule is plain.
@@ -158,6 +159,8 @@ class AVI:
         own = np.full(disc.count, np.inf)
         own[disc.source_cell[real]] = critical[real]
         steps = self.safety * own
+        if self.schedule == "exact":
+            steps = alike(steps)
         if self.steps is not None:
             steps = self._given(problem, own)
         window = window_length(steps, until, problem.comm)

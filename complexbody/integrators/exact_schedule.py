@@ -27,6 +27,18 @@ _TAG = 8
 #: and little is lost in going through all cells for it.
 EVENTS, PER_CELL = 50_000, 1.0
 
+#: Binary digits of a step that is not given.
+DIGITS = 26
+
+
+def alike(steps: Array) -> Array:
+    """h_K rounded to so many binary digits that cells alike but for round-off act together [s].
+
+    Else motion, if ever so little, would run through all of them within one step.
+    """
+    digits, exponent = np.frexp(steps)
+    return np.asarray(np.ldexp(np.round(np.ldexp(digits, DIGITS)), exponent - DIGITS))
+
 
 def span_length(steps: Array, until: float, comm: Any) -> float:
     """Length of a span [s], at most the largest step; ``until`` ends one.

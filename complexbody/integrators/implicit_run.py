@@ -101,6 +101,8 @@ class ImplicitRun(ForceRun):
         self._masses = disc.volume * problem.masses.density[klass]
         self.solver.momenta(kernels.v, self.momentum)
         kernels.reset_forces()
+        if isinstance(self.solver, NodalNewton):
+            self.watch(self.solver.restless())
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -127,6 +129,8 @@ class ImplicitRun(ForceRun):
                 kernels.sums[4] += self._support_work(kernels.v, before)
                 kernels.sums[4] += self._support_work(self.next, 1.0 - before)
             self.solver.commit()
+            if self.activity is not None:
+                kernels.c.cb_look(self.state)
             if len(problem.load_value):
                 for t in (self.time, self.time + h):
                     power = problem.load_power(self.amplitude(t), kernels.v)
@@ -213,7 +217,7 @@ class ImplicitRun(ForceRun):
         """
         problem, sums = self.problem, self.problem.kernels.sums
         _, rates = self.sample()
-        common = energies(problem, self.mass, rates)
+        common = energies(problem, self.mass, rates, self.watched)
         common["kinetic_nu"] = self.solver.kinetic(rates)
         self._measure(rates)
         work, support, lost = float(sums[3]), float(sums[4]) + self.support_work, float(sums[0])

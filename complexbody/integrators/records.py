@@ -64,6 +64,7 @@ class RecordRun(Counted):
         time: t at the last beat's end [s]; steps: beats done; step: their length [s].
         critical: Critical step of the smallest cell [s], that of a synchronous run.
         record: Node records (nodes + 1, doubles per node); the last one is padding.
+        losing: Whether nodes keep account of what they dissipate.
         acted: Nodes that loads or constant forces of the bodies act on, on any rank.
         skips_energies: Whether quiet cells have no energy either.
         time_sets: Who acts when: what the paper calls Θ, with speed-ups.
@@ -141,7 +142,9 @@ class RecordRun(Counted):
         problem, method = self.problem, self.method
         disc, masses = problem.disc, problem.masses
         n, record = disc.n, disc.record
-        size, self._time, self._inverse = events.record_size(n, record, bool(method.balanced))
+        self.losing = method.schedule == "exact" and masses.damped
+        third = bool(method.balanced) or self.losing
+        size, self._time, self._inverse = events.record_size(n, record, third)
         self.record = native.aligned((disc.nodes + 1, size))
         self.record[:-1, :n] = problem.initial_fields
         self.record[:-1, self._inverse] = 1.0 / disc.volume

@@ -16,11 +16,9 @@ from mpi4py import MPI
 
 from complexbody import native
 from complexbody.errors import IntegratorError
-from complexbody.integrators.activity import ENOUGH, Activity, active
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.synchronous_books import entries
-from complexbody.kernels.library import State
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -50,8 +48,6 @@ class SynchronousRun(ForceRun):
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
-        watched: What the C functions read, with the activity in it; None if energies of quiet cells
-            are not zero.
         support_work: Work of this rank's moving supports in the half step before a sample [J].
     """
 
@@ -63,7 +59,6 @@ class SynchronousRun(ForceRun):
             refuse_partial(problem)
         kernels.select(masses.diagonal, masses.damped)
         self.c = kernels.c
-        self.watched: State | None = None
         rec = masses.recursion(step, method.dissipation)
         if method.start == "one-sided":
             # Kicks sit at the left ends of intervals: momenta at t_n are those before the kick.
@@ -90,26 +85,7 @@ class SynchronousRun(ForceRun):
         kernels.x[:-1, : disc.n] = problem.initial_fields
         self.support_work = 0.0
         kernels.reset_forces()
-        # A copy, since whoever else asks the kernels asks for all cells.
-        self._own = State.from_buffer_copy(s)
-        self.state = ctypes.byref(self._own)
-
-    def watch(self) -> None:
-        """Skip what is quiet from now on, if enough is; before the first step."""
-        problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
-        if not (problem.quiet and disc.blocks):
-            return
-        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
-        stirred = (stirred | (kernels.f[:-1, : disc.n] != 0)).any(axis=1)
-        stirred[problem.load_position // disc.record] = True
-        if active(disc.cells, stirred) > ENOUGH:
-            return
-        awake, energetic = kernels.restless()
-        ends, late = np.append(disc.chunks[:, 3], disc.nodes), np.array([len(disc.chunks)])
-        self.activity = Activity(self.c, disc.chunks[:, 1], disc.cells, ends, stirred, awake, late)
-        self._own.activity = ctypes.addressof(self.activity.state)
-        self.watched = None if energetic else self._own
-        self.c.cb_look(self.state)
+        self._state_of_its_own()
 
     # --- steps -------------------------------------------------------------------------------
 

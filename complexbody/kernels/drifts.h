@@ -2,13 +2,16 @@
  * Asynchronous events: what nodes and cells carry, and how a node drifts from kick to kick. Behind
  * vectors.h, tabulated.h and quiet.h. A node's record holds everything a drift needs:
  *   [ position (NR) | rate (NR) | acceleration (NR, only if BALANCED) | time, 1/volume ]
+ * and on an EXACT schedule that is DAMPED what the node has dissipated in place of an acceleration:
+ * its drifts have an order, those of different nodes depend on how the schedule goes.
  * time and 1/volume sit in the padding of position where there is room (TIME, INVERSE).
- * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK. Unless SLOW,
- * inertia is diagonal and the components of nu share one rate. */
+ * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK, EXACT. Unless
+ * SLOW, inertia is diagonal and the components of nu share one rate. */
 
 #define VN (NR < 8 ? NR : 8)
 typedef double nvec __attribute__((vector_size(8 * VN), aligned(8)));
-#define PARTS (2 + BALANCED)
+#define LOSING (EXACT && DAMPED)
+#define PARTS (2 + BALANCED + LOSING)
 #if NR - N >= 2
 #define RECORD (PARTS * NR)
 #define TIME N
@@ -146,7 +149,11 @@ INLINE void drift_slowly(const world *s, int64_t a, double dt) {
     for (int j = 0; j < N; j++) sum += V[i * N + j] * mean[j];
     r[i] += dt * sum;
   }
+#if LOSING
+  r[2 * NR] += s->counted[a] ? dt * lost / r[INVERSE] : 0.0;
+#else
   if (s->counted[a]) s->sums[0] += dt * lost / r[INVERSE];
+#endif
 }
 #endif
 
@@ -194,8 +201,10 @@ INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
   memcpy(c, &d, sizeof c);
   volume = dt / volume;
   memcpy(weight, &volume, sizeof weight);
+#if !LOSING
   nvec lost[NR / VN];
   memset(lost, 0, sizeof lost);
+#endif
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);
     if (r[TIME] == t[l]) continue; /* at rest in time, or a node that comes again */
@@ -213,13 +222,19 @@ INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
       v[g] += nu[g] * ((c[3][l] - 1.0) * v[g]);
 #endif
       x[g] = timed(x[g] + c[0][l] * mean, g, t[l]);
+#if LOSING
+      ((nvec *)(r + 2 * NR))[g] += weight[l] * eta[g] * mean * mean;
+#else
       lost[g] += weight[l] * eta[g] * mean * mean;
+#endif
     }
     if (TIME >= NR) r[TIME] = t[l];
   }
+#if !LOSING
   double sum = 0;
   for (int i = 0; i < NR; i++) sum += lost[i / VN][i % VN];
   s->sums[0] += sum;
+#endif
 #else
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);

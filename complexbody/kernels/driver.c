@@ -133,14 +133,7 @@ void cb_forces(const state *s) { act(s, 0, s->chunks, 0); }
 /* After a step: chunks that the motion has reached. Forces depend on positions alone. */
 void cb_look(const state *s) {
   activity *q = quiet(s);
-  for (int64_t c = 0; q && c < q->chunks; c++) {
-    if (q->awake[c] || !q->near[c]) continue;
-    for (int64_t i = q->node_from[c]; i < q->node_from[c + 1]; i++)
-      if (!at_zero(s->x + (int64_t)q->node[i] * NR, NR)) {
-        wake(q, c);
-        break;
-      }
-  }
+  for (int64_t c = 0; q && c < q->chunks; c++) look_at(q, c, s->x, NR);
 }
 
 /* Where cells have forces (by chunk) or energies even at x = 0, which s->x must be. */
