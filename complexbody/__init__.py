@@ -7,7 +7,10 @@ After M. Focardi and P. M. Mariano, *Discrete dynamics of complex bodies with su
 dissipation: variational integrators and convergence* ("the paper" in docstrings).
 """
 
+from complexbody import rotations
 from complexbody.body import Body
+from complexbody.densities import deformation
+from complexbody.derived import derived_fields
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
@@ -15,6 +18,9 @@ from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
+from complexbody.linearise import Prestress, linearise, prestress
+from complexbody.momentum import angular_momentum
+from complexbody.objectivity import Objectivity, objectivity
 from complexbody.output import Output
 from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
@@ -38,20 +44,29 @@ __all__ = [
     "Initial",
     "LocalLeapfrog",
     "Newmark",
+    "Objectivity",
     "Output",
     "PetscTS",
     "Plan",
     "Pressure",
+    "Prestress",
     "Result",
     "Scene",
     "Synchronous",
     "Traction",
+    "angular_momentum",
     "chart",
     "constant",
+    "deformation",
+    "derived_fields",
+    "linearise",
+    "objectivity",
     "plan",
+    "prestress",
     "ramp",
     "realised_speed_up",
     "ricker",
+    "rotations",
     "simulate",
     "sine",
     "stability",
