@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import ufl
-from mpi4py import MPI
 from ufl.algorithms import extract_coefficients
 
 from complexbody import _compat
@@ -227,7 +226,8 @@ def _largest(values: Sequence[Any]) -> Array:
     cells = np.arange(_compat.cell_count(mesh)[0], dtype=np.int32)
     compiled = _compat.expression(expression, _compat.cell_space(mesh))
     found = _compat.evaluate(compiled, mesh, cells)
-    top = mesh.comm.allreduce(found.max(axis=0, initial=-np.inf), op=MPI.MAX)
-    low = mesh.comm.allreduce(found.min(axis=0, initial=np.inf), op=MPI.MIN)
+    # A rank without cells has infinities of the sign that do not count.
+    ends = np.array([found.max(axis=0, initial=-np.inf), -found.min(axis=0, initial=np.inf)])
+    top, low = np.max(mesh.comm.allgather(ends), axis=0) * [[1.0], [-1.0]]
     out[varying] = np.where(np.abs(top) >= np.abs(low), top, low)
     return out

@@ -167,7 +167,8 @@ def test_pictures(comm, result, shared_path):
 
 def test_averages_at_nodes_are_in_files_and_do_not_depend_on_ranks(comm, shared_path):
     """The same numbers as serially, under the symbol of the cells' field."""
-    names = ("cauchy_stress_at_nodes", "dissipation_at_nodes", "actual_microstress")
+    names = ("cauchy_stress_at_nodes", "dissipation_at_nodes", "cauchy_stress")
+    names += ("actual_microstress", "actual_self_action")
     for ranks, folder in ((comm, "all"), (MPI.COMM_SELF, f"alone-{comm.rank}")):
         scene = Scene(mesh.create_unit_square(ranks, 4, 3), body(2))
         with Writer(Action(scene), Output(shared_path / folder, fields=names)) as writer:

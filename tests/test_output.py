@@ -62,7 +62,8 @@ def test_nodal_fields_are_read_back(comm, shared_path, dim, n_u, k):
 def test_files_do_not_depend_on_ranks(comm, shared_path, dim):
     """Every number is where a serial run puts it."""
     h5py = pytest.importorskip("h5py")
-    names = (*NODE_FIELDS, *CELL_FIELDS)
+    # det F of these fields comes near zero: those divided by it are in test_derived.py.
+    names = (*NODE_FIELDS, *(n for n in CELL_FIELDS if not n.startswith(("cauchy", "actual"))))
     for ranks, folder in ((comm, "all"), (MPI.COMM_SELF, f"alone-{comm.rank}")):
         scene = Scene(domain(ranks, dim), body())
         with Writer(Action(scene), Output(shared_path / folder, fields=names)) as writer:
