@@ -26,6 +26,7 @@ from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
+from complexbody.show import Look, show
 from complexbody.simulate import simulate
 from complexbody.stability import stability
 from complexbody.workprecision import Chart, chart
@@ -43,6 +44,7 @@ __all__ = [
     "Implicit",
     "Initial",
     "LocalLeapfrog",
+    "Look",
     "Newmark",
     "Objectivity",
     "Output",
@@ -67,6 +69,7 @@ __all__ = [
     "realised_speed_up",
     "ricker",
     "rotations",
+    "show",
     "simulate",
     "sine",
     "stability",
