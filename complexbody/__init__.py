@@ -7,8 +7,11 @@ After M. Focardi and P. M. Mariano, *Discrete dynamics of complex bodies with su
 dissipation: variational integrators and convergence* ("the paper" in docstrings).
 """
 
+from complexbody import rotations
 from complexbody.body import Body
 from complexbody.dispersion_picture import plot_dispersion
+from complexbody.densities import deformation
+from complexbody.derived import derived_fields
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
@@ -16,6 +19,9 @@ from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
+from complexbody.linearise import Prestress, linearise, prestress
+from complexbody.momentum import angular_momentum
+from complexbody.objectivity import Objectivity, objectivity
 from complexbody.output import Output
 from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
@@ -41,21 +47,30 @@ __all__ = [
     "LocalLeapfrog",
     "Look",
     "Newmark",
+    "Objectivity",
     "Output",
     "PetscTS",
     "Plan",
     "Pressure",
+    "Prestress",
     "Result",
     "Scene",
     "Synchronous",
     "Traction",
+    "angular_momentum",
     "chart",
     "constant",
+    "deformation",
+    "derived_fields",
+    "linearise",
+    "objectivity",
     "plan",
     "plot_dispersion",
+    "prestress",
     "ramp",
     "realised_speed_up",
     "ricker",
+    "rotations",
     "show",
     "simulate",
     "sine",

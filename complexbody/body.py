@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody.errors import BodyError
+from complexbody.rotations import RotationAction
 
 Number = float | int
 Matrix = npt.NDArray[np.float64]
@@ -48,6 +49,8 @@ class Body:
             one UFL estimates.
         name: What to call it in tables and messages.
         constants: The constants it was made of, by name, for tables and result files.
+        rotation: How ν turns with the body (:mod:`complexbody.rotations`): then runs book angular
+            momentum, and ``cb.objectivity`` checks the energy.
 
     Raises:
         BodyError: for shapes, signs or values that no body can have.
@@ -63,6 +66,7 @@ class Body:
     quadrature_degree: int | None = None
     name: str = "body"
     constants: Mapping[str, float] = field(default_factory=dict)
+    rotation: RotationAction | None = None
 
     def __post_init__(self) -> None:
         for name in ("descriptor", "displacement"):
@@ -81,6 +85,11 @@ class Body:
             raise BodyError(
                 "Body: potential is not a function. Give potential=f(u, nu) returning a scalar UFL "
                 "expression in J/m³, or None."
+            )
+        if self.rotation is not None and self.rotation.components != self.descriptor:
+            raise BodyError(
+                f"Body: rotation {self.rotation.name!r} acts on {self.rotation.components} "
+                f"components, but the descriptor has {self.descriptor}. Give one that fits."
             )
         if not (_is_number(self.density) or hasattr(self.density, "function_space")):
             raise BodyError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Calling a user's density: a scalar UFL expression, or a clear error."""
+"""Calling a user's density: a scalar UFL expression, or a clear error; and F for those in F."""
 
 from __future__ import annotations
 
@@ -33,3 +33,23 @@ def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
             "its indices, for instance with ufl.inner."
         )
     return value
+
+
+def deformation(U: Any) -> Any:
+    """F = I + ∇u of U = ∇u, shape (n_u, 3), as a 3×3 UFL tensor for energies e(F, ν, N).
+
+    Where u has less than three components the missing ones are zero (plane strain).
+
+    Raises:
+        BodyError: for more than three rows.
+    """
+    rows = U.ufl_shape[0]
+    if rows > 3:
+        raise BodyError(f"deformation: U has {rows} rows, but space has three. Give n_u ≤ 3.")
+    return ufl.as_tensor(
+        [
+            [(U[i, j] if i < rows else ufl.as_ufl(0.0)) + (1.0 if i == j else 0.0)
+             for j in range(3)]
+            for i in range(3)
+        ]
+    )  # fmt: skip

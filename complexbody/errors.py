@@ -24,6 +24,18 @@ class CoercivityError(BodyError):
     """The Hessian of the energy density is not symmetric, not finite or not coercive (A1)."""
 
 
+class PrestressError(BodyError):
+    """A state to linearise about is not natural: P̄, z̄ or S̄ is not zero there.
+
+    Attributes:
+        prestress: The :class:`complexbody.linearise.Prestress` there.
+    """
+
+    def __init__(self, message: str, prestress: Any = None) -> None:
+        super().__init__(message)
+        self.prestress = prestress
+
+
 class SceneError(ComplexBodyError, ValueError):
     """A scene does not fit together: supports, loads, tags, initial data."""
 

@@ -15,6 +15,7 @@ the largest energy.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ import numpy.typing as npt
 
 from complexbody.errors import DivergenceError, ResultsError
 from complexbody.integrators.entries import Entries, Run
+from complexbody.momentum import AngularMomentum, axes_of
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
@@ -41,11 +43,13 @@ class Ledger:
     ``ledger["stored"]`` is a column as an array. ``balance`` is the energy that came from nowhere
     since the start [J]; ``variation_u`` and ``variation_nu`` are pV of the rates,
     ∫ Σ_steps |q̇⁺ − q̇⁻|₁ dx (paper, Proposition 1, in the 1-norm over components), nan where an
-    integrator does not measure it.
+    integrator does not measure it. Bodies that say how ν turns have ``angular_momentum_3`` about
+    the origin (in 3D 1 to 3), with ν's share (:mod:`complexbody.momentum`).
     """
 
-    def __init__(self, displacement: int) -> None:
+    def __init__(self, displacement: int, axes: Sequence[int] = ()) -> None:
         self.columns = [*COLUMNS, *(f"momentum_{i + 1}" for i in range(displacement))]
+        self.columns += [f"angular_momentum_{axis + 1}" for axis in axes]
         self.rows: list[list[float]] = []
 
     def __getitem__(self, name: str) -> Array:
@@ -59,7 +63,8 @@ class Ledger:
 
     def units(self) -> list[str]:
         """Unit of each column."""
-        return [COLUMNS.get(name, "N s") for name in self.columns]
+        rest = ("N m s" if name.startswith("angular") else "N s" for name in self.columns)
+        return [COLUMNS.get(name, unit) for name, unit in zip(self.columns, rest, strict=True)]
 
 
 class Bookkeeper:
@@ -74,7 +79,9 @@ class Bookkeeper:
 
     def __init__(self, problem: Problem, run: Run, growth: float | None = 10.0) -> None:
         self.problem, self.run, self.growth = problem, run, growth
-        self.ledger = Ledger(problem.whole.displacement)
+        self._axes = list(axes_of(problem.whole))
+        self._angular = AngularMomentum(problem) if self._axes else None
+        self.ledger = Ledger(problem.whole.displacement, self._axes)
         self._start: float | None = None
         self._put = 0.0
         self._reference: float | None = None
@@ -106,6 +113,9 @@ class Bookkeeper:
         record[:n_u] = e.momentum
         momentum = self.problem.spread(record)[: self.problem.whole.displacement]
         row += [e.variation_u, e.variation_nu, *momentum]
+        if self._angular is not None:
+            moments = self.problem.comm.allreduce(self._angular(*run.sample()))
+            row += moments[self._axes].tolist()
         self.ledger.rows.append([float(v) for v in row])
         self._guard(e.surplus - self._start if run.steps > 0 else 0.0)
         return self.ledger.rows[-1]

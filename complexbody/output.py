@@ -16,13 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import ufl
-from dolfinx import fem
 
 from complexbody import _compat
 from complexbody._compat import Array
 from complexbody.action import Action
-from complexbody.densities import scalar
+from complexbody.derived import CELL_FIELDS, NODAL_FIELDS, Derived
 from complexbody.errors import OutputError, SceneError
 from complexbody.files import CsvWriter, Series, in_input_order, on_first_rank
 from complexbody.probes import Probes
@@ -30,8 +28,6 @@ from complexbody.probes import Probes
 __all__ = ["CELL_FIELDS", "NODE_FIELDS", "STEP_FIELDS", "CsvWriter", "Output", "Probes", "Writer"]
 
 NODE_FIELDS = ("u", "nu", "u_dot", "nu_dot")
-#: Fields per cell and the symbols they are stored under.
-CELL_FIELDS = {"stress": "P", "self_action": "z", "microstress": "S", "energy_density": "e"}
 #: Fields per cell that a run decides once, at its start.
 STEP_FIELDS = {"steps": "h", "levels": "level"}
 MOST_TIMES = 1_000_000
@@ -46,8 +42,9 @@ class Output:
         every: Time between outputs [s]. The start and the end are always written.
         times: Output times [s] instead of ``every``; those after the end are passed over.
         fields: Of "u", "nu", "u_dot", "nu_dot" (per node), "stress" P, "self_action" z,
-            "microstress" S and "energy_density" ρe (per cell, at its midpoint); and, written once,
-            each cell's step "steps" h_K [s] and "levels", its octave below the longest.
+            "microstress" S, "energy_density" ρe and the others of :mod:`complexbody.derived` (per
+            cell, at its midpoint; with "_at_nodes" behind the name averaged to nodes); and, written
+            once, each cell's step "steps" h_K [s] and "levels", its octave below the longest.
         probes: Points by name, one coordinate per dimension of the mesh [m], whose fields go to a
             table.
         probe_steps: Rows of that table are this many steps apart.
@@ -73,7 +70,7 @@ class Output:
         object.__setattr__(self, "times", tuple(np.atleast_1d(self.times)))
         known = (*NODE_FIELDS, *CELL_FIELDS, *STEP_FIELDS)
         for name in self.fields:
-            if name not in known:
+            if name not in (*known, *NODAL_FIELDS):
                 raise OutputError(f"Output: field {name!r} is not known. Give {', '.join(known)}.")
         if self.every is not None and len(self.times):
             raise OutputError("Output: every and times exclude each other. Give one of them.")
@@ -135,7 +132,8 @@ class Writer:
         self._comm, self._nodes = mesh.comm, _compat.node_map(mesh).size_local
         self._fields = tuple(name for name in output.fields if name not in STEP_FIELDS)
         self._once = tuple(name for name in output.fields if name in STEP_FIELDS)
-        self._derived = _Derived(action, [name for name in self._fields if name in CELL_FIELDS])
+        derived = {**CELL_FIELDS, **NODAL_FIELDS}
+        self._derived = Derived(action, [name for name in self._fields if name in derived])
         (points, cells), self._order = in_input_order(mesh)
         self._series: dict[str, Series] = {}
 
@@ -143,7 +141,7 @@ class Writer:
             self._folder.mkdir(parents=True, exist_ok=True)
             cellwise = {**CELL_FIELDS, **STEP_FIELDS}
             for name in output.fields:
-                symbol = cellwise.get(name, name)
+                symbol = {**cellwise, **NODAL_FIELDS}.get(name, name)
                 center = "Cell" if name in cellwise else "Node"
                 path = self._folder / name
                 self._series[name] = Series(path, symbol, center, points, cells, resume)
@@ -158,7 +156,7 @@ class Writer:
         Args:
             time: When.
             state: Blocked P1 Functions on the scene's mesh by name: those of "u", "nu", "u_dot",
-                "nu_dot" that are written, and "u" and "nu" where a field per cell is.
+                "nu_dot" that are written, and all four where a derived field is.
 
         Raises:
             OutputError: if rank 0 cannot write.
@@ -169,8 +167,7 @@ class Writer:
             mine = derived[name] if name in derived else _owned(state[name], self._nodes)
             parts = self._comm.gather(_padded(name, mine))
             if parts is not None:
-                values[name] = np.concatenate(parts)[self._order[name in derived]]
-
+                values[name] = np.concatenate(parts)[self._order[name in CELL_FIELDS]]
         self._append(float(time), values)
 
     def write_steps(self, steps: Mapping[str, Array]) -> None:
@@ -206,48 +203,6 @@ class Writer:
         self.close()
 
 
-class _Derived:
-    """Fields per cell: derivatives of each body's energy at cell midpoints, compiled once."""
-
-    def __init__(self, action: Action, names: Sequence[str]) -> None:
-        self._names, self._scene = names, action.scene
-        if not names:
-            return
-        self._q, self._regions = fem.Function(action.space), action.scene.regions()
-        self._expressions = []
-        for body in action.scene.bodies:
-            _, *arguments = action.fields(self._q)
-            nu, U, N = (ufl.variable(argument) for argument in arguments)
-            energy = scalar(f"energy of {body.name}", body.energy, U, nu, N)
-            values = [*(ufl.diff(energy, argument) for argument in (U, nu, N)), energy]
-            fields = dict(zip(CELL_FIELDS, values, strict=True))
-            self._shapes = [fields[name].ufl_shape for name in names]
-            # q[0] ties the expression to the mesh, also where the energy does not depend on q.
-            parts = [self._q[0]]
-            for name in names:
-                shape = fields[name].ufl_shape
-                parts += [fields[name][i] if shape else fields[name] for i in np.ndindex(shape)]
-            space = _compat.cell_space(action.scene.mesh)  # its one point is the midpoint
-            self._expressions.append(_compat.expression(ufl.as_vector(parts), space))
-
-    def evaluate(self, state: Mapping[str, Any]) -> dict[str, Array]:
-        """Each field on this rank's owned cells, shape (cells, components, row by row)."""
-        if not self._names:
-            return {}
-        scene, nodes = self._scene, _compat.node_map(self._scene.mesh).size_local
-        record = self._q.x.array.reshape(-1, scene.components)
-        for name in ("u", "nu"):
-            record[:nodes, scene.components_of(name)] = _owned(state[name], nodes)
-        self._q.x.scatter_forward()
-        sizes = [math.prod(shape) for shape in self._shapes]
-        values = np.zeros((len(self._regions), 1 + sum(sizes)))
-        for region, expression in enumerate(self._expressions):
-            cells = np.flatnonzero(self._regions == region).astype(np.int32)
-            values[cells] = _compat.evaluate(expression, scene.mesh, cells)
-        columns = np.split(values, np.cumsum([1, *sizes]), axis=1)[1:-1]
-        return dict(zip(self._names, columns, strict=True))
-
-
 def _owned(function: Any, nodes: int) -> Array:
     """Values of a blocked P1 Function at this rank's own nodes, shape (nodes, components)."""
     block = function.function_space.dofmap.index_map_bs
@@ -257,7 +212,7 @@ def _owned(function: Any, nodes: int) -> Array:
 def _padded(name: str, values: Array) -> Array:
     """With zeros to make two components a vector, and two rows a tensor, as ParaView wants them."""
     count = values.shape[1]
-    full = {6: 9} if name in ("stress", "microstress") else {2: 3}
+    full = {6: 9} if "stress" in name else {2: 3}
     return np.pad(values, ((0, 0), (0, full.get(count, count) - count)))
 
 
