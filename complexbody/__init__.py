@@ -19,7 +19,7 @@ from complexbody.output import Output
 from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
-from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
+from complexbody.scene import Absorb, BodyForce, Fix, Initial, Pressure, Scene, Traction
 from complexbody.simulate import simulate
 from complexbody.stability import stability
 from complexbody.workprecision import Chart, chart
@@ -28,6 +28,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AVI",
+    "Absorb",
     "AssembledLeapfrog",
     "Body",
     "BodyForce",
