@@ -151,6 +151,7 @@ class Masses:
         classes: Class of each node, shape (nodes + 1,), int32.
         density: ρ per class; inertia, viscosity: Ω, η per class (classes, k, k).
         damping: D per class (classes, n, n), with dampers.
+        dampers: Classes whose damping is not η alone.
         fixed: Prescribed components per class (classes, n).
         diagonal: True if no class couples components by inertia or damping.
         only_dampers_couple: True if without dampers it would be.
@@ -209,6 +210,7 @@ class Masses:
             self.damping += added[first]
             self.whole = dampers.coupled
             self.diagonal &= not dampers.coupled
+        self.dampers = np.any(self.damping != self.full(self.viscosity), axis=(1, 2))
         self.pure = region[first] >= 0
         # First component of the block that M and D may couple, and a basis there.
         self._bases: list[tuple[int, tuple[Array, Array, Array]]] = []

@@ -267,8 +267,7 @@ def _shared_mass(problem: Problem, h: float, scheme: str) -> float:
         back = np.linalg.inv(basis)
         parts.append(back.T @ np.diag(effective(m, d, h, scheme)) @ back)
     n_u = masses.n_u
-    added = np.any(masses.damping != masses.full(masses.viscosity), axis=(1, 2))
-    mixed = np.flatnonzero(~masses.pure | added)
+    mixed = np.flatnonzero(~masses.pure | masses.dampers)
     node = np.unique(masses.classes[:-1], return_index=True)[1][mixed]
     weight = disc.region_volume[node] / disc.volume[node, None]
     total = np.einsum("cr,rij->cij", weight, np.array(parts))
