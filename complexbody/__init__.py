@@ -19,7 +19,17 @@ from complexbody.output import Output
 from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
-from complexbody.scene import Absorb, BodyForce, Fix, Initial, Pressure, Scene, Traction
+from complexbody.scene import (
+    Absorb,
+    BodyForce,
+    Fix,
+    Initial,
+    PointSource,
+    Pressure,
+    Scene,
+    Symmetry,
+    Traction,
+)
 from complexbody.simulate import simulate
 from complexbody.stability import stability
 from complexbody.workprecision import Chart, chart
@@ -42,9 +52,11 @@ __all__ = [
     "Output",
     "PetscTS",
     "Plan",
+    "PointSource",
     "Pressure",
     "Result",
     "Scene",
+    "Symmetry",
     "Synchronous",
     "Traction",
     "chart",

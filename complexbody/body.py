@@ -48,6 +48,8 @@ class Body:
             one UFL estimates.
         name: What to call it in tables and messages.
         constants: The constants it was made of, by name, for tables and result files.
+        parity: How ν goes under a mirror, if a :class:`complexbody.Symmetry` is to know: "polar",
+            "axial", "even", "odd", "tensor", or None.
 
     Raises:
         BodyError: for shapes, signs or values that no body can have.
@@ -63,6 +65,7 @@ class Body:
     quadrature_degree: int | None = None
     name: str = "body"
     constants: Mapping[str, float] = field(default_factory=dict)
+    parity: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("descriptor", "displacement"):

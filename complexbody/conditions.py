@@ -66,3 +66,63 @@ class Absorb:
         f = self.frequency
         if f is not None and not (np.isfinite(f) and f > 0):
             raise SceneError(f"Absorb: frequency is {f}. Give a positive number of Hz, or None.")
+
+
+@dataclass(frozen=True)
+class PointSource:
+    r"""A force at a point, or a moment: Fδ(x − x_s) − Div(Mδ(x − x_s)) times a history.
+
+    Its nodal forces are consistent with P1 fields: the total force is F to round-off. What the
+    source radiates converges with the mesh everywhere but at the point itself, and so do powers
+    (each finite on a given mesh).
+
+    Attributes:
+        at: The point x_s [m], anywhere in the body; one coordinate per dimension of the mesh.
+        vector: F, one number per component of the field [N in 3D, N/m in 2D, N/m² in 1D, or their
+            partners on ν].
+        history: Factor of time.
+        field: "u" or "nu".
+        moment: M [N m and so on], one row per component of the field and one column per direction:
+            symmetric for a moment tensor on u (m₀(e₁⊗e₂ + e₂⊗e₁) is a double couple). Its nodal
+            forces have that moment exactly, spread over the cells around the point.
+    """
+
+    at: Sequence[float] | float
+    vector: Sequence[float] | float | None = None
+    history: History = Constant()
+    field: str = "u"
+    moment: Any = None
+
+    def __post_init__(self) -> None:
+        known_field("PointSource", self.field)
+        if self.vector is None and self.moment is None:
+            raise SceneError("PointSource: it has no vector and no moment. Give one of them.")
+        if not np.all(np.isfinite(np.asarray(self.at, dtype=np.float64))):
+            raise SceneError(f"PointSource: at={self.at!r} is no point. Give finite coordinates.")
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    r"""A plane of symmetry among a scene's supports: the body goes on behind it as in a mirror.
+
+    On the plane, components that the mirror turns round are fixed to zero, and the others are free.
+    The mirror I − 2n⊗n acts on u as on a vector, and on ν by its parity R: what is fixed are the
+    components with R = −1. That the body's energy, inertia, viscosity and potential do not change
+    under the mirror is checked; that initial data and loads do not is the user's matter.
+
+    The plane must be perpendicular to a coordinate axis, since supports fix components.
+
+    Attributes:
+        where: Facet tag(s), "boundary", or a predicate that holds at all vertices of a facet.
+        parity: How ν goes under the mirror Q: "polar" (a vector, Qν), "axial" (a rotation, −Qν),
+            "even" or "odd" (scalars), "tensor" (k = d² components ν_ij row by row, QνQᵀ), or the
+            k×k matrix R itself. By default what the body says (:attr:`complexbody.Body.parity`).
+        normal: The axis, as a vector; by default the facets' normal.
+        u: The same for u: "polar" by default; of one component in more than one dimension "even" or
+            "odd" must be given.
+    """
+
+    where: Where
+    parity: Any = None
+    normal: Sequence[float] | None = None
+    u: Any = "polar"

@@ -18,6 +18,7 @@ from mpi4py import MPI
 from complexbody import _compat
 from complexbody.boundary import entities
 from complexbody.errors import IntegratorError, SceneError, agree
+from complexbody.facets import exterior
 from complexbody.impedance import impedance
 
 if TYPE_CHECKING:
@@ -94,18 +95,17 @@ def dampers(problem: Problem) -> Dampers | None:
                 "not overlap."
             )
         seen = np.append(seen, facets)
-        nodes = _compat.facet_nodes(mesh, facets)
-        cells, normals, areas = _facets(problem, facets, nodes)
+        found = exterior(mesh, facets)
         error: Exception | None = None
         Z = np.zeros((len(facets), n, n))
         try:
-            Z = materials.impedances(cells, normals, absorb.frequency, absorb.field)
-        except SceneError as found:
-            error = found
+            Z = materials.impedances(found.cells, found.normals, absorb.frequency, absorb.field)
+        except SceneError as refusal:
+            error = refusal
         agree(mesh.comm, error)
-        share = areas[:, None, None] / dim * Z
+        share = found.areas[:, None, None] / dim * Z
         for vertex in range(dim):
-            np.add.at(total, nodes[:, vertex], share)
+            np.add.at(total, found.nodes[:, vertex], share)
     off = ~np.eye(n, dtype=bool)
     coupled = bool(mesh.comm.allreduce(bool(np.any(total[:, off])), op=MPI.LOR))
     used = np.flatnonzero(np.any(total, axis=(1, 2)))
@@ -123,27 +123,6 @@ def refuse_dampers(problem: Problem, what: str) -> None:
             f"{what} takes no absorbing boundary: it damps ν alone. Use Synchronous(), AVI(), "
             "LocalLeapfrog(), or a peer such as Newmark()."
         )
-
-
-def _facets(problem: Problem, facets: Ints, nodes: Ints) -> tuple[Ints, Array, Array]:
-    """Cells of exterior facets, outward unit normals (facets, 3) and areas."""
-    mesh, dim = problem.scene.mesh, problem.scene.mesh.geometry.dim
-    x = np.asarray(mesh.geometry.x)
-    to_cell = mesh.topology.connectivity(dim - 1, dim)
-    cells = np.asarray(to_cell.array[to_cell.offsets[facets]], dtype=np.int64)
-    corners = x[nodes].reshape(len(facets), dim, 3)
-    out = corners.mean(axis=1) - x[_compat.cell_nodes(mesh)[cells]].mean(axis=1)
-    if dim == 1:
-        normals = out * [1.0, 0.0, 0.0]
-        areas = np.ones(len(facets))
-    else:
-        edges = corners[:, 1:] - corners[:, :1]
-        normals = np.cross(edges[:, 0], edges[:, 1] if dim == 3 else [0.0, 0.0, 1.0])
-        areas = np.linalg.norm(normals, axis=1) / (2.0 if dim == 3 else 1.0)
-    normals = normals * np.sign(np.einsum("fi,fi->f", normals, out))[:, None]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    # Round-off of meshes along axes, so that their components stay apart and facets alike.
-    return cells, np.where(np.abs(normals) < 1e-13, 0.0, normals), areas
 
 
 class _Materials:

@@ -28,6 +28,7 @@ from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
 from complexbody.masses import Masses
+from complexbody.mirrors import check_mirrors
 from complexbody.reduction import reduced_data, reduced_scene
 from complexbody.scene import FIELDS, Scene
 from complexbody.stiffness import self_stiffness
@@ -83,6 +84,7 @@ class Problem:
         self.known_steps: dict[str, Array] = {}
         self.arrange()
         self.warnings = check_energy(self)
+        check_mirrors(self)
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
         self.full: Problem = self
         if reduce:

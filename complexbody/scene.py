@@ -7,7 +7,7 @@ out which nodes a predicate selects, is the business of :mod:`complexbody.discre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,14 +15,14 @@ import numpy as np
 
 from complexbody import _compat
 from complexbody.body import Body
-from complexbody.conditions import FIELDS, Absorb, Value, Where, known_field
+from complexbody.conditions import FIELDS, Absorb, PointSource, Symmetry, Value, Where, known_field
 from complexbody.errors import MeshError, SceneError, agree
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
 
 __all__ = [
-    "FIELDS", "Absorb", "BodyForce", "Fix", "Initial", "Pressure", "Scene", "Traction", "Value",
-    "Where",
+    "FIELDS", "Absorb", "BodyForce", "Fix", "Initial", "PointSource", "Pressure", "Scene",
+    "Symmetry", "Traction", "Value", "Where",
 ]  # fmt: skip
 
 
@@ -102,7 +102,7 @@ class Initial:
     nu_dot: Value | None = None
 
 
-Load = Traction | Pressure | BodyForce
+Load = Traction | Pressure | BodyForce | PointSource
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,9 @@ class Scene:
     Attributes:
         mesh: A dolfinx mesh of intervals, triangles or tetrahedra with straight cells.
         body: One :class:`Body`, or ``{cell tag: Body}`` together with ``cell_tags``.
-        supports: :class:`Fix` objects.
-        loads: :class:`Traction`, :class:`Pressure` and :class:`BodyForce` objects.
+        supports: :class:`Fix` and :class:`Symmetry` objects.
+        loads: :class:`Traction`, :class:`Pressure`, :class:`BodyForce` and :class:`PointSource`
+            objects.
         absorbing: :class:`Absorb` objects: where waves leave the body.
         initial: Initial data; zero by default.
         cell_tags: dolfinx MeshTags of cells, needed where bodies or loads name cell tags.
@@ -130,7 +131,7 @@ class Scene:
 
     mesh: Any
     body: Body | Mapping[int, Body]
-    supports: Sequence[Fix] = ()
+    supports: Sequence[Fix | Symmetry] = ()
     loads: Sequence[Load] = ()
     initial: Initial = field(default_factory=Initial)
     cell_tags: Any = None
@@ -140,7 +141,7 @@ class Scene:
     absorbing: Sequence[Absorb] | Absorb = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "supports", _several(self.supports, "supports", Fix))
+        object.__setattr__(self, "supports", _several(self.supports, "supports", Fix | Symmetry))
         object.__setattr__(self, "loads", _several(self.loads, "loads", Load))
         object.__setattr__(self, "absorbing", _several(self.absorbing, "absorbing", Absorb))
         self._check_mesh()
@@ -274,6 +275,8 @@ class Scene:
         comm = self.mesh.comm
         error: Exception | None = None
         for thing in (*self.supports, *self.loads, *self.absorbing):
+            if isinstance(thing, PointSource):
+                continue
             where = thing.where
             cells = isinstance(thing, BodyForce)
             tags, kind = (self.cell_tags, "cell_tags") if cells else (self.facet_tags, "facet_tags")

@@ -122,5 +122,6 @@ def isotropic_two_field(
     require(family, inequality, pressure * own, shared**2, remedy)
     energy = _energy(d, **constants)
     return Body(
-        d, energy, density, inertia, viscosity, displacement=d, name=name, constants=constants
-    )
+        d, energy, density, inertia, viscosity, displacement=d, name=name, constants=constants,
+        parity="polar",
+    )  # fmt: skip
