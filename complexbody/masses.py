@@ -12,6 +12,8 @@ recursion with an effective mass
 v the *mean* rate of a drift: :math:`\hat M = M` ("symmetric"), :math:`M + hD/2` ("forward"),
 :math:`(hD/2)\coth(hD/(2M))` ("exact": the exact flow of ρ̄ν̈ + ην̇ = 0 between kicks; its limit
 M → 0 is hD/2, that of "forward"). Hence one stability criterion, 4M̂ − h²K ≻ 0, and one energy.
+A damper's hD/M is about one on any mesh, so that M̂ would not tend to M: those of absorbing
+boundaries are in D alone, "symmetric" in all schemes. They change no critical step.
 """
 
 from __future__ import annotations
@@ -212,15 +214,9 @@ class Masses:
             self.diagonal &= not dampers.coupled
         self.dampers = np.any(self.damping != self.full(self.viscosity), axis=(1, 2))
         self.pure = region[first] >= 0
-        # First component of the block that M and D may couple, and a basis there.
-        self._bases: list[tuple[int, tuple[Array, Array, Array]]] = []
-        mass = self.full(self.inertia, self.density)
-        for c in range(len(first)):
-            if np.any(self.damping[c, : self.n_u]):
-                self._bases.append((0, damped_basis(mass[c], self.damping[c])))
-            else:
-                D = self.damping[c, self.n_u :, self.n_u :]
-                self._bases.append((self.n_u, pencil_basis(self.inertia[c], D)))
+        self._bases = [
+            pencil_basis(o, e) for o, e in zip(self.inertia, self.viscosity, strict=True)
+        ]
 
     @property
     def one_rate(self) -> bool:
@@ -244,7 +240,7 @@ class Masses:
         m, d = np.einsum("cii->ci", mass).copy(), np.einsum("cii->ci", damping).copy()
         if not self.diagonal:
             for c, fixed in enumerate(self.fixed):
-                start = self._bases[c][0]
+                start = 0 if self.dampers[c] else self.n_u
                 free = start + np.flatnonzero(~fixed[start:])
                 if free.size:
                     ix = np.ix_(free, free)
@@ -262,17 +258,17 @@ class Masses:
 
     def effective(self, h: float, scheme: str) -> Array:
         """M̂ of every class for the step h, shape (classes, n, n)."""
-        out = self.full(self.inertia, self.density)
-        for c, (start, (vectors, m, d)) in enumerate(self._bases):
+        blocks = np.zeros_like(self.inertia)
+        for c, (vectors, m, d) in enumerate(self._bases):
             if scheme == "symmetric" or not self.damped:
                 effective(m, d, h, scheme)  # refuses missing inertia
+                blocks[c] = self.inertia[c]
             elif scheme == "forward":
-                out[c] += 0.5 * h * self.damping[c]
+                blocks[c] = self.inertia[c] + 0.5 * h * self.viscosity[c]
             else:
                 back = np.linalg.inv(vectors)
-                block = back.T @ np.diag(effective(m, d, h, scheme)) @ back
-                out[c, start:, start:] = block
-        return out
+                blocks[c] = back.T @ np.diag(effective(m, d, h, scheme)) @ back
+        return self.full(blocks, self.density)
 
     def recursion(self, h: float, scheme: str) -> Recursion:
         """Everything a step of length h needs, per class.

@@ -60,8 +60,9 @@ def point_load(scene: Scene, source: PointSource) -> tuple[Ints, Ints, Array]:
     forces = np.einsum("c,ca,i->cai", share, weights, vector)
     forces += np.einsum("c,caj,ij->cai", share, gradients, moment[:, :dim])
     vertices = nodes[cells].astype(np.int64)
-    node = np.repeat(vertices.ravel(), len(rows))
-    return node, np.tile(rows, vertices.size), forces.ravel()
+    node, value = np.repeat(vertices.ravel(), len(rows)), forces.ravel()
+    acts = value != 0
+    return node[acts], np.tile(rows, vertices.size)[acts], value[acts]
 
 
 def _around(at: Array, x: Array, nodes: Ints) -> tuple[Ints, Array, Array, Array]:

@@ -232,9 +232,7 @@ def _cell_steps(problem: Problem, scheme: str) -> Array:
         raise StepError(
             "The stiffness of a cell is not finite at the initial state. Check the energy there."
         )
-    viscous = any(np.any(body.viscosity_matrix) for body in problem.scene.bodies)
-    mixed = len(problem.scene.bodies) > 1 or problem.masses.absorbing
-    if mixed and viscous and scheme == "exact":
+    if len(problem.scene.bodies) > 1 and problem.masses.damped and scheme == "exact":
         out *= _shared_step(problem, float(np.min(out, initial=np.inf)), scheme)
     return out
 
@@ -242,7 +240,6 @@ def _cell_steps(problem: Problem, scheme: str) -> Array:
 def _shared_step(problem: Problem, h: float, scheme: str) -> float:
     """Factor below 1 that makes the smallest step h of the cells safe at nodes of several bodies.
 
-    Or at those of dampers on a viscous body: M̂ need not grow with D where matrices do not commute.
     There M̂ is that of the averages of M and D, r times the average of the bodies' M̂ or more. As
     M̂(h)/h falls with h, 4M̂_K(h) ⪰ h²K gives 4M̂_K(h') ⪰ h'hK for h' < h: so h' ≤ r(h')h is enough.
     """
@@ -266,22 +263,14 @@ def _shared_mass(problem: Problem, h: float, scheme: str) -> float:
         m = m + 0.25 * h * h * np.einsum("ji,jk,ki->i", basis, S, basis)
         back = np.linalg.inv(basis)
         parts.append(back.T @ np.diag(effective(m, d, h, scheme)) @ back)
-    n_u = masses.n_u
-    mixed = np.flatnonzero(~masses.pure | masses.dampers)
+    mixed = np.flatnonzero(~masses.pure)
     node = np.unique(masses.classes[:-1], return_index=True)[1][mixed]
     weight = disc.region_volume[node] / disc.volume[node, None]
     total = np.einsum("cr,rij->cij", weight, np.array(parts))
     if np.any(problem.self_stiffness):
-        # Of the same classes or finer: h is the same for all nodes.
-        fixed = masses.fixed[masses.classes[:-1]]
-        masses = Masses(disc, fixed, problem.self_stiffness, h, problem.dampers)
-    whole = masses.effective(h, scheme)[mixed]
-    shares = np.zeros_like(whole)
-    shares[:, range(n_u), range(n_u)] = masses.density[mixed, None]
-    shares[:, n_u:, n_u:] = total
-    # In units of the shares: u and ν have units of their own.
-    root = np.linalg.inv(np.linalg.cholesky(shares))
-    ratios = np.linalg.eigvalsh(root @ whole @ root.transpose(0, 2, 1))
+        masses = Masses(disc, masses.fixed[masses.classes[:-1]], problem.self_stiffness, h, problem.dampers)
+    whole = masses.effective(h, scheme)[mixed, masses.n_u :, masses.n_u :]
+    ratios = np.linalg.eigvals(np.linalg.solve(total, whole)).real
     return float(problem.comm.allreduce(float(ratios.min(initial=1.0)), op=MPI.MIN))
 
 
