@@ -239,7 +239,10 @@ class Masses:
         vectors = np.tile(np.eye(self.n), (count, 1, 1))
         m, d = np.einsum("cii->ci", mass).copy(), np.einsum("cii->ci", damping).copy()
         if not self.diagonal:
-            for c, fixed in enumerate(self.fixed):
+            off = ~np.eye(self.n, dtype=bool)
+            coupled = np.any(mass[:, off], axis=1) | np.any(damping[:, off], axis=1)
+            for c in np.flatnonzero(coupled):
+                fixed = self.fixed[c]
                 start = 0 if self.dampers[c] else self.n_u
                 free = start + np.flatnonzero(~fixed[start:])
                 if free.size:

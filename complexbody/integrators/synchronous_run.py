@@ -90,6 +90,11 @@ class SynchronousRun(ForceRun):
         self.mass = np.ascontiguousarray(rec.mass)
         s = kernels.state
         s.step = step
+        off = ~np.eye(disc.n, dtype=bool)
+        coupled = [np.any(m[:, off], axis=1) for m in (rec.alpha, rec.beta, rec.viscosity)]
+        self._plain = (~np.any(coupled, axis=0)).astype(np.uint8)
+        # Only of dampers: in other scenes all nodes have blocks alike.
+        s.plain = self._plain.ctypes.data if masses.whole else 0
         s.alpha, s.beta, s.eta = (t.ctypes.data for t in self._tables)
         self._single = len(masses.density) == 1
         s.klass = 0 if self._single else masses.classes.ctypes.data

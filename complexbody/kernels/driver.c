@@ -30,6 +30,7 @@ typedef struct {
   const uint8_t *counted;         /* 1 where this rank counts the node in sums, [node] */
   const tabulated *forms;         /* [region]{force, stored, potential energy}, where FFCx made them */
   activity *activity;             /* of chunks, and of the nodes each finishes; or NULL */
+  const uint8_t *plain;       /* unless DIAGONAL: [class] 1 where the matrices are; or NULL */
 } state;
 
 #define VN (NR < 8 ? NR : 8) /* components of one node vector */
@@ -66,14 +67,20 @@ static APART void update(const state *s, int64_t first, int64_t last) {
     const double *al = s->alpha + k * N * N, *be = s->beta + k * N * N;
     double now[NR] = {0};
     const double *vo = (const double *)v, *fo = (const double *)f;
-    for (int i = 0; i < COUPLED; i++) now[i] = al[i * N + i] * vo[i] + be[i * N + i] * iv * fo[i];
-    for (int i = COUPLED; i < N; i++) {
+    const int coupled = s->plain && s->plain[k] ? N : COUPLED;
+    for (int i = 0; i < coupled; i++) now[i] = al[i * N + i] * vo[i] + be[i * N + i] * iv * fo[i];
+    for (int i = coupled; i < N; i++) {
       double sum = 0;
       for (int j = COUPLED; j < N; j++) sum += al[i * N + j] * vo[j] + be[i * N + j] * iv * fo[j];
       now[i] = sum;
     }
 #if DAMPED
-    for (int i = COUPLED; i < N; i++)
+    if (s->plain && s->plain[k])
+      for (int i = 0; i < N; i++) {
+        const double both = vo[i] + now[i];
+        lost[0][0] += vol * s->eta[(k * N + i) * N + i] * both * both;
+      }
+    for (int i = coupled; i < N; i++)
       for (int j = COUPLED; j < N; j++)
         lost[0][0] += vol * s->eta[k * N * N + i * N + j] * (vo[i] + now[i]) * (vo[j] + now[j]);
 #endif

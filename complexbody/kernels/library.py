@@ -38,7 +38,7 @@ class State(ctypes.Structure):
             for name in (
                 "table", "cell", "geometry", "coefficient", "x", "v", "f", "constant", "volume",
                 "inverse_volume", "klass", "alpha", "beta", "eta", "sums", "coordinates", "counted",
-                "forms", "activity",
+                "forms", "activity", "plain",
             )
         ),
     )  # fmt: skip
