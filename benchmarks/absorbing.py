@@ -16,6 +16,7 @@ import complexbody as cb
 from complexbody import meshes
 from complexbody.forms import isotropic_two_field
 from complexbody.impedance import impedance
+from complexbody.problem import Problem
 
 COMM = MPI.COMM_WORLD
 KINDS = ("S of ν", "S of u", "P of ν", "P of u")
@@ -26,8 +27,6 @@ def moduli(**constants):
     """H of the two-field body without self-action, M, and the body itself, d = 2."""
     body = isotropic_two_field(d=2, k0=1e-9, **constants)
     mesh = meshes.rectangle(MPI.COMM_SELF, (0, 0), (1, 1), (1, 1))
-    from complexbody.problem import Problem
-
     H = Problem(cb.Scene(mesh, body)).hessian_samples(0)[0]
     return body, H, np.eye(4)
 
@@ -60,9 +59,11 @@ def exact(H, M, kind, angle):
     def flux(kx, a):
         return float((0.5 * np.conj(-1j * omega * a) @ -traction(kx, a)).real)
 
-    system = np.stack([traction(s, v) - 1j * omega * Z @ v for s, v in zip(kx, a.T)], axis=1)
+    every = [traction(s, v) - 1j * omega * Z @ v for s, v in zip(kx, a.T, strict=True)]
+    system = np.stack(every, axis=1)
     amount = np.linalg.solve(system, -(traction(k[0], incident) - 1j * omega * Z @ incident))
-    returned = sum(flux(s, v * m) for s, v, m in zip(kx, a.T, amount) if abs(s.imag) < 1e-6)
+    waves = [(s, v * m) for s, v, m in zip(kx, a.T, amount, strict=True) if abs(s.imag) < 1e-6]
+    returned = sum(flux(s, v) for s, v in waves)
     return -returned / flux(k[0], incident)
 
 
@@ -91,7 +92,7 @@ def measured(body, H, M, kind, angle, cells=16):
     values = {
         name + suffix: (lambda x, f=f, rate=rate: f * wave(x, rate))
         for suffix, rate in (("", False), ("_dot", True))
-        for name, f in zip(("u", "nu"), fields)
+        for name, f in zip(("u", "nu"), fields, strict=True)
     }
     absorbing = [cb.Absorb(where=lambda x: x[0] > end - 1e-9)]
     scene = cb.Scene(mesh, body, initial=cb.Initial(**values), absorbing=absorbing)

@@ -121,11 +121,13 @@ def supports(scene: Scene, action: Action) -> Supports:
     error: Exception | None = None
     for support in scene.supports:
         facets = entities(scene, support)
-        parts = [support]
+        what = type(support).__name__
         if isinstance(support, Symmetry):
-            parts = _mirror(scene, support, facets, out)
+            fixes = _mirror(scene, support, facets, out)
+        else:
+            fixes, what = [support], f"Fix({support.field!r})"
         if facets is None:
-            mask, problem = _mask(f"Fix({support.field!r})", support.where, x.T)
+            mask, problem = _mask(what, support.where, x.T)
             agree(comm, problem)
             nodes = np.flatnonzero(mask)
         else:
@@ -133,13 +135,12 @@ def supports(scene: Scene, action: Action) -> Supports:
             mesh.topology.create_connectivity(dim, dim + 1)
             nodes = np.asarray(fem.locate_dofs_topological(action.space, dim, facets))
         if comm.allreduce(len(nodes)) == 0 and error is None:
-            what = "Symmetry(" if isinstance(support, Symmetry) else f"Fix({support.field!r}, "
             error = SceneError(
-                f"{what}where={support.where!r}) selects no node. Check the predicate's tolerance "
-                "or the tag."
+                f"{what} with where={support.where!r} selects no node. Check the predicate's "
+                "tolerance or the tag."
             )
-        for part in parts:
-            error = error or _prescribe(scene, out, part, nodes, x)
+        for fix in fixes:
+            error = error or _prescribe(scene, out, fix, nodes, x)
     agree(comm, error)
     return out
 

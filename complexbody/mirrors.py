@@ -212,7 +212,9 @@ def sampled(scene: Scene, number: int, what: str, Q: Array, S: Array, R: Array) 
         scene: The scene.
         number: Region, in up to 64 of whose cells on this rank three random states are looked at.
         what: "energy" or "potential".
-        Q, S, R: What the mirror does to space, to u, and to ν.
+        Q: What the mirror does to space.
+        S: To u.
+        R: To ν.
     """
     mesh, body, dim = scene.mesh, scene.bodies[number], scene.mesh.geometry.dim
     n_u, k = scene.displacement, scene.descriptor

@@ -138,7 +138,7 @@ class Scene:
     facet_tags: Any = None
     self_action: str = "consistent"
     name: str = "scene"
-    absorbing: Sequence[Absorb] | Absorb = ()
+    absorbing: Sequence[Absorb] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "supports", _several(self.supports, "supports", Fix | Symmetry))

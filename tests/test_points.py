@@ -107,7 +107,7 @@ def test_ranks_agree_and_nothing_that_moves_is_left_out():
 
 @pytest.mark.serial
 def test_d_alembert():
-    """u(x, t) = (1/2ρc) ∫ F g ds up to t − |x − x_s|/c, order 2; ends that absorb change nothing."""
+    """u(x, t) = (1/2ρc) ∫ F g ds up to t − |x − x_s|/c, order 2; ends absorb."""
     body = cb.Body(1, lambda U, v, N: 0.5 * 4 * U[0, 0] ** 2 + N[0, 0] ** 2, 1.0, 1.0,
                    displacement=1)  # fmt: skip
     history, c, at, until, errors = cb.ricker(4.0), 2.0, 0.437, 0.6, []

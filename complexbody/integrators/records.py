@@ -40,8 +40,8 @@ class World(ctypes.Structure):
         *(
             (name, ctypes.c_void_p)
             for name in (
-                "record", "klass", "inverse_mass", "rate", "pace", "paced", "plain", "compliance", "eta",
-                "basis",
+                "record", "klass", "inverse_mass", "rate", "pace", "paced", "plain", "compliance",
+                "eta", "basis",
                 "collected",
                 "groups", "cell", "geometry", "coefficient", "held", "blend", "sums",
                 "counted", "coordinates", "forms", "touched", "touched_from", "activity",
@@ -121,10 +121,10 @@ class RecordRun(Counted):
         world.nodes, world.late, world.beyond = disc.nodes, disc.late, disc.late + disc.shared
         self._point(
             record=self.record, klass=masses.classes, inverse_mass=self.inverse_mass,
-            rate=self.rate, pace=self._pace, paced=self._paced, plain=self._simple, compliance=self.compliance,
-            eta=self.eta, basis=self.basis, collected=self.collected, cell=disc.cells,
-            geometry=disc.geometry, coefficient=kernels.coefficients, sums=self.sums,
-            counted=self._counted, coordinates=disc.position,
+            rate=self.rate, pace=self._pace, paced=self._paced, plain=self._simple,
+            compliance=self.compliance, eta=self.eta, basis=self.basis, collected=self.collected,
+            cell=disc.cells, geometry=disc.geometry, coefficient=kernels.coefficients,
+            sums=self.sums, counted=self._counted, coordinates=disc.position,
         )  # fmt: skip
         if len(masses.density) == 1:
             world.klass = 0
