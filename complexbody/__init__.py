@@ -8,6 +8,7 @@ dissipation: variational integrators and convergence* ("the paper" in docstrings
 """
 
 from complexbody.body import Body
+from complexbody.dispersion_picture import plot_dispersion
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
@@ -30,6 +31,7 @@ from complexbody.scene import (
     Symmetry,
     Traction,
 )
+from complexbody.show import Look, show
 from complexbody.simulate import simulate
 from complexbody.stability import stability
 from complexbody.workprecision import Chart, chart
@@ -48,6 +50,7 @@ __all__ = [
     "Implicit",
     "Initial",
     "LocalLeapfrog",
+    "Look",
     "Newmark",
     "Output",
     "PetscTS",
@@ -62,9 +65,11 @@ __all__ = [
     "chart",
     "constant",
     "plan",
+    "plot_dispersion",
     "ramp",
     "realised_speed_up",
     "ricker",
+    "show",
     "simulate",
     "sine",
     "stability",
