@@ -9,9 +9,9 @@ dissipation: variational integrators and convergence* ("the paper" in docstrings
 
 from complexbody import rotations
 from complexbody.body import Body
-from complexbody.dispersion_picture import plot_dispersion
 from complexbody.densities import deformation
 from complexbody.derived import derived_fields
+from complexbody.dispersion_picture import plot_dispersion
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
@@ -26,7 +26,17 @@ from complexbody.output import Output
 from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
-from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
+from complexbody.scene import (
+    Absorb,
+    BodyForce,
+    Fix,
+    Initial,
+    PointSource,
+    Pressure,
+    Scene,
+    Symmetry,
+    Traction,
+)
 from complexbody.show import Look, show
 from complexbody.simulate import simulate
 from complexbody.stability import stability
@@ -36,6 +46,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AVI",
+    "Absorb",
     "AssembledLeapfrog",
     "Body",
     "BodyForce",
@@ -51,10 +62,12 @@ __all__ = [
     "Output",
     "PetscTS",
     "Plan",
+    "PointSource",
     "Pressure",
     "Prestress",
     "Result",
     "Scene",
+    "Symmetry",
     "Synchronous",
     "Traction",
     "angular_momentum",

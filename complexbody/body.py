@@ -51,6 +51,8 @@ class Body:
         constants: The constants it was made of, by name, for tables and result files.
         rotation: How ν turns with the body (:mod:`complexbody.rotations`): then runs book angular
             momentum, and ``cb.objectivity`` checks the energy.
+        parity: How ν goes under a mirror, if a :class:`complexbody.Symmetry` is to know: "polar",
+            "axial", "even", "odd", "tensor", or None.
 
     Raises:
         BodyError: for shapes, signs or values that no body can have.
@@ -67,6 +69,7 @@ class Body:
     name: str = "body"
     constants: Mapping[str, float] = field(default_factory=dict)
     rotation: RotationAction | None = None
+    parity: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("descriptor", "displacement"):

@@ -7,7 +7,7 @@ assembled once, each with a history. Knows no time step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,8 +17,11 @@ from dolfinx import mesh as dmesh
 
 from complexbody import _compat
 from complexbody.action import Action
+from complexbody.conditions import PointSource, Symmetry
 from complexbody.errors import SceneError, agree
 from complexbody.histories import Constant, History
+from complexbody.mirrors import fixed_components, mirror_plane
+from complexbody.points import point_load
 from complexbody.scene import FIELDS, BodyForce, Fix, Scene
 
 Array = npt.NDArray[np.float64]
@@ -34,12 +37,14 @@ class Supports:
         value: Prescribed value at factor 1, same shape.
         history: Index into ``histories`` per entry, same shape (0 where not prescribed).
         histories: The histories; index 0 is constant.
+        mirrors: Planes of symmetry among them, and the axis that each is perpendicular to.
     """
 
     fixed: npt.NDArray[np.bool_]
     value: Array
     history: npt.NDArray[np.int32]
     histories: list[History]
+    mirrors: list[tuple[Symmetry, int]] = field(default_factory=list)
 
     @property
     def moving(self) -> npt.NDArray[np.bool_]:
@@ -114,10 +119,15 @@ def supports(scene: Scene, action: Action) -> Supports:
     shape = (len(x), scene.components)
     out = Supports(np.zeros(shape, bool), np.zeros(shape), np.zeros(shape, np.int32), [Constant()])
     error: Exception | None = None
-    for fix in scene.supports:
-        facets = entities(scene, fix)
+    for support in scene.supports:
+        facets = entities(scene, support)
+        what = type(support).__name__
+        if isinstance(support, Symmetry):
+            fixes = _mirror(scene, support, facets, out)
+        else:
+            fixes, what = [support], f"Fix({support.field!r})"
         if facets is None:
-            mask, problem = _mask(f"Fix({fix.field!r})", fix.where, x.T)
+            mask, problem = _mask(what, support.where, x.T)
             agree(comm, problem)
             nodes = np.flatnonzero(mask)
         else:
@@ -126,12 +136,27 @@ def supports(scene: Scene, action: Action) -> Supports:
             nodes = np.asarray(fem.locate_dofs_topological(action.space, dim, facets))
         if comm.allreduce(len(nodes)) == 0 and error is None:
             error = SceneError(
-                f"Fix({fix.field!r}, where={fix.where!r}) selects no node. Check the predicate's "
+                f"{what} with where={support.where!r} selects no node. Check the predicate's "
                 "tolerance or the tag."
             )
-        error = error or _prescribe(scene, out, fix, nodes, x)
+        for fix in fixes:
+            error = error or _prescribe(scene, out, fix, nodes, x)
     agree(comm, error)
     return out
+
+
+def _mirror(scene: Scene, support: Symmetry, facets: Any, out: Supports) -> list[Fix]:
+    """What a plane of symmetry fixes; collective."""
+    if scene.mesh.comm.allreduce(len(facets)) == 0:
+        return []  # which is refused
+    axis = mirror_plane(scene, support, facets)
+    out.mirrors.append((support, axis))
+    fixed = fixed_components(scene, support, axis)
+    return [
+        Fix(name, support.where, components=components.tolist())
+        for name, components in fixed.items()
+        if len(components)
+    ]
 
 
 def _prescribe(scene: Scene, out: Supports, fix: Fix, nodes: Any, x: Any) -> Exception | None:
@@ -221,55 +246,64 @@ class Loads:
 
 
 def loads(scene: Scene, action: Action) -> Loads:
-    """Assemble the loads of a scene by dolfinx, one vector each, before any halo sum; collective.
+    """The loads of a scene, by dolfinx but for those at points, before any halo sum; collective.
 
     Raises:
         SceneError: if a load selects nothing or its vector misfits (on all ranks).
     """
-    comm, mesh = scene.mesh.comm, scene.mesh
     rows: list[tuple[Any, ...]] = []
     histories: list[History] = []
     for load in scene.loads:
-        tags = None
-        if not isinstance(load, BodyForce):
-            facets = np.sort(entities(scene, load)).astype(np.int32)  # type: ignore[arg-type]
-            if comm.allreduce(len(facets)) == 0:
-                raise SceneError(
-                    f"{type(load).__name__}(where={load.where!r}) selects no boundary facet. Check "
-                    "the predicate's tolerance or the tag."
-                )
-            ones = np.full(len(facets), 1, dtype=np.int32)
-            tags = dmesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
-        error: Exception | None = None
-        form = None
-        try:
-            form = action.load_form(load, tags, 1)
-        except SceneError as found:
-            error = found
-        except Exception as found:  # a user's callable may fail in any way
-            error = SceneError(
-                f"{type(load).__name__}: vector cannot be evaluated: {type(found).__name__}: "
-                f"{found}. Give numbers, or a callable of x (3, npts) -> (components, npts)."
-            )
-        agree(comm, error)
-        vector = np.zeros(_compat.node_count(mesh) * scene.components)
-        fem.assemble_vector(vector, _compat.form(form))
-        if not np.all(np.isfinite(vector)):
-            error = SceneError(
-                f"{type(load).__name__}: the load is not finite everywhere. Check its vector or "
-                "pressure."
-            )
-        agree(comm, error)
-        entry = np.flatnonzero(vector)
+        if isinstance(load, PointSource):
+            node, component, value = point_load(scene, load)
+        else:
+            node, component, value = _distributed(scene, action, load)
         if load.history not in histories:
             histories.append(load.history)
-        group = np.full(len(entry), histories.index(load.history), np.int32)
-        rows.append((entry // scene.components, entry % scene.components, group, vector[entry]))
+        group = np.full(len(node), histories.index(load.history), np.int32)
+        rows.append((node, component, group, value))
     if not rows:
         empty = np.zeros(0, np.int64)
         return Loads(empty, empty, empty.astype(np.int32), np.zeros(0), [])
     node, component, group, value = (np.concatenate(c) for c in zip(*rows, strict=True))
     return Loads(node.astype(np.int64), component.astype(np.int64), group, value, histories)
+
+
+def _distributed(scene: Scene, action: Action, load: Any) -> tuple[Ints, Ints, Array]:
+    """Nodes, components and values of a load on facets or cells, at factor 1; collective."""
+    comm, mesh = scene.mesh.comm, scene.mesh
+    tags = None
+    if not isinstance(load, BodyForce):
+        facets = np.sort(entities(scene, load)).astype(np.int32)  # type: ignore[arg-type]
+        if comm.allreduce(len(facets)) == 0:
+            raise SceneError(
+                f"{type(load).__name__}(where={load.where!r}) selects no boundary facet. Check "
+                "the predicate's tolerance or the tag."
+            )
+        ones = np.full(len(facets), 1, dtype=np.int32)
+        tags = dmesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
+    error: Exception | None = None
+    form = None
+    try:
+        form = action.load_form(load, tags, 1)
+    except SceneError as found:
+        error = found
+    except Exception as found:  # a user's callable may fail in any way
+        error = SceneError(
+            f"{type(load).__name__}: vector cannot be evaluated: {type(found).__name__}: "
+            f"{found}. Give numbers, or a callable of x (3, npts) -> (components, npts)."
+        )
+    agree(comm, error)
+    vector = np.zeros(_compat.node_count(mesh) * scene.components)
+    fem.assemble_vector(vector, _compat.form(form))
+    if not np.all(np.isfinite(vector)):
+        error = SceneError(
+            f"{type(load).__name__}: the load is not finite everywhere. Check its vector or "
+            "pressure."
+        )
+    agree(comm, error)
+    entry = np.flatnonzero(vector)
+    return entry // scene.components, entry % scene.components, vector[entry]
 
 
 def initial(scene: Scene, action: Action) -> tuple[Array, Array]:

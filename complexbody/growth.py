@@ -150,7 +150,7 @@ def weights(problem: Any, step: float) -> Array:
     """Inertia per class and component, hη where there is none; 0 on supports. (classes, n)."""
     masses = problem.masses
     mass = np.einsum("cii->ci", masses.full(masses.inertia, masses.density))
-    loss = np.einsum("cii->ci", masses.full(masses.viscosity)) * step
+    loss = np.einsum("cii->ci", masses.damping) * step
     return np.where(masses.fixed, 0.0, np.where(mass > 0, mass, loss))
 
 

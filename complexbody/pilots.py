@@ -169,7 +169,7 @@ class Pilots:
         problem, disc, kernels = self.problem, self.problem.disc, self.problem.kernels
         masses, out = problem.masses, np.zeros(2)
         mass = masses.full(masses.inertia, masses.density)[masses.classes[:-1]]
-        eta = masses.full(masses.viscosity)[masses.classes[:-1]]
+        eta = masses.damping[masses.classes[:-1]]
         weight = disc.volume * disc.owned
         for i, columns in enumerate((slice(0, self.n_u), slice(self.n_u, disc.n))):
             s = np.zeros((disc.nodes, disc.n))

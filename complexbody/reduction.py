@@ -75,7 +75,7 @@ def reduced_scene(scene: Scene, live: Live) -> Scene:
     body: Body | dict[int, Body] = bodies[0]
     if not isinstance(scene.body, Body):
         body = dict(zip(sorted(scene.body), bodies, strict=True))
-    return replace(scene, body=body, supports=(), loads=(), initial=Initial())
+    return replace(scene, body=body, supports=(), loads=(), absorbing=(), initial=Initial())
 
 
 def reduced_data(

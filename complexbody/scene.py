@@ -7,7 +7,7 @@ out which nodes a predicate selects, is the business of :mod:`complexbody.discre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,16 +15,15 @@ import numpy as np
 
 from complexbody import _compat
 from complexbody.body import Body
+from complexbody.conditions import FIELDS, Absorb, PointSource, Symmetry, Value, Where, known_field
 from complexbody.errors import MeshError, SceneError, agree
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
 
-#: A facet tag, several of them, "boundary", or a predicate of x (3, npts) -> bool (npts,).
-Where = int | Sequence[int] | str | Callable[[Any], Any]
-#: A number, one number per component, or a callable of x (3, npts) -> (components, npts).
-Value = float | Sequence[float] | Callable[[Any], Any]
-
-FIELDS = ("u", "nu")
+__all__ = [
+    "FIELDS", "Absorb", "BodyForce", "Fix", "Initial", "PointSource", "Pressure", "Scene",
+    "Symmetry", "Traction", "Value", "Where",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Fix:
     history: History = Constant()
 
     def __post_init__(self) -> None:
-        _known_field("Fix", self.field)
+        known_field("Fix", self.field)
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,7 @@ class Traction:
     field: str = "u"
 
     def __post_init__(self) -> None:
-        _known_field("Traction", self.field)
+        known_field("Traction", self.field)
 
 
 @dataclass(frozen=True)
@@ -90,7 +89,7 @@ class BodyForce:
     field: str = "u"
 
     def __post_init__(self) -> None:
-        _known_field("BodyForce", self.field)
+        known_field("BodyForce", self.field)
 
 
 @dataclass(frozen=True)
@@ -103,7 +102,7 @@ class Initial:
     nu_dot: Value | None = None
 
 
-Load = Traction | Pressure | BodyForce
+Load = Traction | Pressure | BodyForce | PointSource
 
 
 @dataclass(frozen=True)
@@ -113,8 +112,10 @@ class Scene:
     Attributes:
         mesh: A dolfinx mesh of intervals, triangles or tetrahedra with straight cells.
         body: One :class:`Body`, or ``{cell tag: Body}`` together with ``cell_tags``.
-        supports: :class:`Fix` objects.
-        loads: :class:`Traction`, :class:`Pressure` and :class:`BodyForce` objects.
+        supports: :class:`Fix` and :class:`Symmetry` objects.
+        loads: :class:`Traction`, :class:`Pressure`, :class:`BodyForce` and :class:`PointSource`
+            objects.
+        absorbing: :class:`Absorb` objects: where waves leave the body.
         initial: Initial data; zero by default.
         cell_tags: dolfinx MeshTags of cells, needed where bodies or loads name cell tags.
         facet_tags: dolfinx MeshTags of facets, needed where supports or loads name facet tags.
@@ -130,17 +131,19 @@ class Scene:
 
     mesh: Any
     body: Body | Mapping[int, Body]
-    supports: Sequence[Fix] = ()
+    supports: Sequence[Fix | Symmetry] = ()
     loads: Sequence[Load] = ()
     initial: Initial = field(default_factory=Initial)
     cell_tags: Any = None
     facet_tags: Any = None
     self_action: str = "consistent"
     name: str = "scene"
+    absorbing: Sequence[Absorb] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "supports", _several(self.supports, "supports", Fix))
+        object.__setattr__(self, "supports", _several(self.supports, "supports", Fix | Symmetry))
         object.__setattr__(self, "loads", _several(self.loads, "loads", Load))
+        object.__setattr__(self, "absorbing", _several(self.absorbing, "absorbing", Absorb))
         self._check_mesh()
         _compat.equispaced(self.mesh)
         self._check_tag_kinds()
@@ -271,7 +274,9 @@ class Scene:
     def _check_tags(self) -> None:
         comm = self.mesh.comm
         error: Exception | None = None
-        for thing in (*self.supports, *self.loads):
+        for thing in (*self.supports, *self.loads, *self.absorbing):
+            if isinstance(thing, PointSource):
+                continue
             where = thing.where
             cells = isinstance(thing, BodyForce)
             tags, kind = (self.cell_tags, "cell_tags") if cells else (self.facet_tags, "facet_tags")
@@ -297,11 +302,6 @@ class Scene:
                         f"{type(thing).__name__}: no entity has tag {tag} in {kind}. Check the tag."
                     )
         agree(comm, error)
-
-
-def _known_field(what: str, name: str) -> None:
-    if name not in FIELDS:
-        raise SceneError(f"{what}: field is {name!r}. Give 'u' or 'nu'.")
 
 
 def _several(given: Any, name: str, kind: Any) -> tuple[Any, ...]:

@@ -268,7 +268,8 @@ def _shared_mass(problem: Problem, h: float, scheme: str) -> float:
     weight = disc.region_volume[node] / disc.volume[node, None]
     total = np.einsum("cr,rij->cij", weight, np.array(parts))
     if np.any(problem.self_stiffness):
-        masses = Masses(disc, masses.fixed[masses.classes[:-1]], problem.self_stiffness, h)
+        fixed = masses.fixed[masses.classes[:-1]]
+        masses = Masses(disc, fixed, problem.self_stiffness, h, problem.dampers)
     whole = masses.effective(h, scheme)[mixed, masses.n_u :, masses.n_u :]
     ratios = np.linalg.eigvals(np.linalg.solve(total, whole)).real
     return float(problem.comm.allreduce(float(ratios.min(initial=1.0)), op=MPI.MIN))

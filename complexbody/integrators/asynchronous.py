@@ -21,7 +21,7 @@ from complexbody.integrators.exact_run import ExactRun
 from complexbody.integrators.exact_schedule import alike, span_length
 from complexbody.integrators.stiffened import reach, stiffen
 from complexbody.integrators.window_run import WindowRun
-from complexbody.integrators.windows import divisions, graded, window_length
+from complexbody.integrators.windows import apart, divisions, graded, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps, require_constant_inertia
@@ -172,7 +172,8 @@ class AVI:
             return ExactRun(problem, self, span_length(blocks, until, problem.comm), blocks, own)
         octaves = self.schedule == "octaves"
         counts = divisions(steps, window, octaves)
-        problem.arrange(graded(problem, counts) if octaves else counts)
+        counts = graded(problem, counts) if octaves else counts
+        problem.arrange(apart(problem, counts) if self.balanced else counts)
         return WindowRun(problem, self, window, own)
 
     def _given(self, problem: Problem, critical: Array) -> Array:

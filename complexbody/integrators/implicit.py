@@ -16,6 +16,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
+from complexbody.dampers import refuse_dampers
 from complexbody.errors import IntegratorError, StepError
 from complexbody.integrators.implicit_run import ImplicitRun
 from complexbody.integrators.split_run import SplitRun
@@ -128,6 +129,7 @@ class Implicit:
             same = Synchronous(self.step, self.safety, scheme, start, unstable_ok=self.unstable_ok)
             return same.prepare(problem, until)
         require_explicit_self_action(problem.scene, "solving for momenta")
+        refuse_dampers(problem, "Implicit's solving for momenta")
         if massless:
             raise IntegratorError(
                 "Implicit solves for momenta, which a descriptor without inertia does not have. "
@@ -153,6 +155,7 @@ class Implicit:
     def _split(self, problem: Problem, until: float) -> SplitRun:
         """The run that is implicit in ν: its step is that of u with ν held."""
         require_constant_inertia(problem, "Implicit(forces='implicit')")
+        refuse_dampers(problem, "Implicit(forces='implicit')")
         critical = self._critical(problem, HELD)
         step = self.step
         if step is None:

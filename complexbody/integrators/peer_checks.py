@@ -124,6 +124,12 @@ def limit_rk4(problem: Problem) -> float:
         scipy.linalg.eigvalsh(body.viscosity_matrix, body.inertia_matrix)[-1]
         for body in problem.whole.bodies
     ]
+    masses = problem.masses
+    if masses.absorbing:
+        # Relative to inertia, in which u and ν have the same unit; no inertia is refused before.
+        root = np.linalg.inv(np.linalg.cholesky(masses.full(masses.inertia, masses.density)))
+        own = np.linalg.eigvalsh(root @ masses.damping @ root.transpose(0, 2, 1)).max(initial=0.0)
+        rates.append(problem.comm.allreduce(float(own), op=MPI.MAX))
     largest = float(max(rates))
     limit = 2.615 / 2 * critical
     return min(limit, 2.785 / largest) if largest > 0 else limit

@@ -53,7 +53,7 @@ class PeerRun:
         self.problem, self.step, self.critical = problem, step, critical
         self.steps, self.linear = 0, 0
         disc, kernels, masses = problem.disc, problem.kernels, problem.masses
-        kernels.select(masses.diagonal, masses.damped)
+        kernels.select(masses.diagonal, masses.damped, masses.whole)
         # Sums over nodes read each node's class.
         kernels.state.klass = masses.classes.ctypes.data
         kernels.x[:] = 0.0
@@ -66,7 +66,7 @@ class PeerRun:
         self.mass = system.blocks(mass[klass] * volume)
         self.damping: Blocks | None = None
         if masses.damped:
-            self.damping = system.blocks(masses.full(masses.viscosity)[klass] * volume)
+            self.damping = system.blocks(masses.damping[klass] * volume)
         self.v = system.owned(problem.initial_rates)
         self.work = self.lost = 0.0
         self._one, self._two = np.zeros(system.size), np.zeros(system.size)

@@ -40,8 +40,8 @@ class World(ctypes.Structure):
         *(
             (name, ctypes.c_void_p)
             for name in (
-                "record", "klass", "inverse_mass", "rate", "pace", "paced", "compliance", "eta",
-                "basis",
+                "record", "klass", "inverse_mass", "rate", "pace", "paced", "plain", "compliance",
+                "eta", "basis",
                 "collected",
                 "groups", "cell", "geometry", "coefficient", "held", "blend", "sums",
                 "counted", "coordinates", "forms", "touched", "touched_from", "activity",
@@ -99,6 +99,7 @@ class RecordRun(Counted):
         self._pace = np.ascontiguousarray(self.rate.max(axis=1))
         self._paced = native.aligned(self.rate.shape)
         self._paced[:] = self.rate > 0
+        self._simple = self._plain_classes()
         self._counted = np.append(disc.owned, False)  # padding cells' node counts for nothing
         self.halo = disc.halo.widened(sent) if sent > disc.record else disc.halo
         self.sums = kernels.sums
@@ -121,10 +122,10 @@ class RecordRun(Counted):
         world.nodes, world.late, world.beyond = disc.nodes, disc.late, disc.late + disc.shared
         self._point(
             record=self.record, klass=masses.classes, inverse_mass=self.inverse_mass,
-            rate=self.rate, pace=self._pace, paced=self._paced, compliance=self.compliance,
-            eta=self.eta, basis=self.basis, collected=self.collected, cell=disc.cells,
-            geometry=disc.geometry, coefficient=kernels.coefficients, sums=self.sums,
-            counted=self._counted, coordinates=disc.position,
+            rate=self.rate, pace=self._pace, paced=self._paced, plain=self._simple,
+            compliance=self.compliance, eta=self.eta, basis=self.basis, collected=self.collected,
+            cell=disc.cells, geometry=disc.geometry, coefficient=kernels.coefficients,
+            sums=self.sums, counted=self._counted, coordinates=disc.position,
         )  # fmt: skip
         if len(masses.density) == 1:
             world.klass = 0
@@ -169,6 +170,12 @@ class RecordRun(Counted):
         klass = masses.classes[:-1]
         rates = np.einsum("aij,aj->ai", self.inverse_basis[klass], problem.initial_rates)
         self.record[:-1, record : record + n] = np.where(inert[klass], 0.0, rates)
+
+    def _plain_classes(self) -> npt.NDArray[np.uint8]:
+        """Classes without coupling whose components have inertia, and one rate or none."""
+        own = np.abs(self.basis - np.eye(self.problem.disc.n)).max(axis=(1, 2)) == 0
+        one = np.where(self._paced > 0, self.rate == self._pace[:, None], True).all(axis=1)
+        return (own & one & ~np.any(self.compliance, axis=1)).astype(np.uint8)
 
     @property
     def time(self) -> float:

@@ -28,7 +28,7 @@ Array = npt.NDArray[np.float64]
 
 
 def refuse_partial(problem: Problem) -> None:
-    """Refuse moving supports of some components of a descriptor whose inertia couples them.
+    """Refuse moving supports of some of the components that inertia or damping couples.
 
     Raises:
         IntegratorError: on all ranks.
@@ -36,7 +36,17 @@ def refuse_partial(problem: Problem) -> None:
     n_u, (rows, columns) = problem.scene.displacement, problem.moving
     masses, nodes = problem.masses, rows[columns >= n_u]
     bad = not np.all(masses.fixed[masses.classes[nodes], n_u:])
-    if problem.comm.allreduce(bool(bad), op=MPI.LOR):
+    # Dampers couple components of u, too, and more of some nodes than of others.
+    klass = masses.classes[rows]
+    linked = masses.damping[klass, columns] != 0
+    linked[np.arange(len(rows)), columns] = False
+    open_ = bool(np.any(linked & ~masses.fixed[klass]))
+    if problem.comm.allreduce(open_, op=MPI.LOR) and masses.absorbing:
+        raise IntegratorError(
+            "A moving support prescribes some of the components that an absorbing boundary "
+            "couples there. Prescribe all of them, or let the two not overlap."
+        )
+    if problem.comm.allreduce(bool(bad), op=MPI.LOR) and not masses.only_dampers_couple:
         raise IntegratorError(
             "A moving support prescribes some components of a descriptor whose inertia or "
             "viscosity couples them. Prescribe all components there, or diagonalise the matrix."
@@ -57,7 +67,7 @@ class SynchronousRun(ForceRun):
         disc, kernels, masses = problem.disc, problem.kernels, problem.masses
         if not masses.diagonal:  # the same on all ranks, unlike what moves there
             refuse_partial(problem)
-        kernels.select(masses.diagonal, masses.damped)
+        kernels.select(masses.diagonal, masses.damped, masses.whole)
         self.c = kernels.c
         rec = masses.recursion(step, method.dissipation)
         if method.start == "one-sided":
@@ -75,6 +85,11 @@ class SynchronousRun(ForceRun):
         self.mass = np.ascontiguousarray(rec.mass)
         s = kernels.state
         s.step = step
+        off = ~np.eye(disc.n, dtype=bool)
+        coupled = [np.any(m[:, off], axis=1) for m in (rec.alpha, rec.beta, rec.viscosity)]
+        self._plain = (~np.any(coupled, axis=0)).astype(np.uint8)
+        # Only of dampers: in other scenes all nodes have blocks alike.
+        s.plain = self._plain.ctypes.data if masses.whole else 0
         s.alpha, s.beta, s.eta = (t.ctypes.data for t in self._tables)
         self._single = len(masses.density) == 1
         s.klass = 0 if self._single else masses.classes.ctypes.data

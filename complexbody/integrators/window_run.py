@@ -34,7 +34,7 @@ class WindowRun(RecordRun):
     def __init__(self, problem: Problem, method: AVI, window: float, critical: Array) -> None:
         super().__init__(problem, method, window, critical)
         self.plan = WindowPlan(problem.disc, window)
-        count = per_cell(problem.disc, problem.disc.group[:, None])
+        count = per_cell(problem.disc, np.abs(problem.disc.group[:, None]))
         # Half kicks at both ends are one force more than events.
         ends = int(method.start == "trapezoidal" and not method.balanced)
         self.time_sets = time_sets(

@@ -26,13 +26,16 @@ __attribute__((unused)) static void soften_node(const world *s, int64_t a, doubl
 /* The same for W nodes. */
 INLINE void soften(const world *s, const int32_t *c, const vec soft, const vec f[NR], vec q[NR]) {
 #if SLOW
-  for (int l = 0; l < W; l++) {
-    double force[N], at[N];
-    for (int i = 0; i < N; i++) force[i] = f[i][l], at[i] = q[i][l];
-    soften_node(s, c[l], soft[l], force, at);
-    for (int i = 0; i < N; i++) q[i][l] = at[i];
+  if (!all_plain(s, c)) {
+    for (int l = 0; l < W; l++) {
+      double force[N], at[N];
+      for (int i = 0; i < N; i++) force[i] = f[i][l], at[i] = q[i][l];
+      soften_node(s, c[l], soft[l], force, at);
+      for (int i = 0; i < N; i++) q[i][l] = at[i];
+    }
+    return;
   }
-#else
+#endif
   vec inverse;
   for (int l = 0; l < W; l++) inverse[l] = c[l] < s->nodes ? record_of(s, c[l])[INVERSE] : 0.0;
   inverse *= soft;
@@ -45,7 +48,6 @@ INLINE void soften(const world *s, const int32_t *c, const vec soft, const vec f
     for (int l = 0; l < W; l++) m[l] = s->inverse_mass[s->klass[c[l]] * NR + i];
     q[i] += m * inverse * f[i];
   }
-#endif
 }
 
 /* Forces of up to W cells of a density that is not quadratic, each at its own time. */
