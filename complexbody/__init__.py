@@ -16,6 +16,7 @@ from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.output import Output
+from complexbody.periodicity import Periodic
 from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
@@ -39,6 +40,7 @@ __all__ = [
     "LocalLeapfrog",
     "Newmark",
     "Output",
+    "Periodic",
     "PetscTS",
     "Plan",
     "Pressure",

@@ -260,8 +260,8 @@ def facet_nodes(domain: mesh.Mesh, facets: Ints) -> Ints:
     to_cell = domain.topology.connectivity(tdim - 1, tdim)
     to_facet = domain.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
     cells = to_cell.array[to_cell.offsets[facets]]
-    # Facet i of a simplex lies opposite to its vertex i.
-    beside = to_facet[cells] != np.asarray(facets)[:, None]
+    # Facet i of a simplex lies opposite to its vertex i; of an interval it is its vertex i.
+    beside = (to_facet[cells] != np.asarray(facets)[:, None]) == (tdim > 1)
     return cell_nodes(domain)[cells][beside].reshape(-1, tdim)
 
 

@@ -209,7 +209,7 @@ def sizes(problem: Problem) -> tuple[float, float]:
     volume = disc.geometry[:, -1, :][disc.source_cell >= 0] ** 2
     parts = comm.allgather(volume)
     cell = float(np.median(np.concatenate(parts))) ** (1 / disc.dim)
-    x = disc.position[:-1, : disc.dim]
+    x = np.asarray(problem.scene.mesh.geometry.x)[:, : disc.dim]
     low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
     high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
     return cell, float(np.max(high - low))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from complexbody.body import Body
 from complexbody.errors import MeshError, SceneError, agree
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
+from complexbody.periodicity import Identified, Periodic, checked, identify
 
 #: A facet tag, several of them, "boundary", or a predicate of x (3, npts) -> bool (npts,).
 Where = int | Sequence[int] | str | Callable[[Any], Any]
@@ -122,6 +124,8 @@ class Scene:
             "lumped" by the vertex rule; "implicit" lumps it and steps over it where it is faster
             than waves across a cell (:mod:`complexbody.stiffness`).
         name: What to call it in tables and files.
+        periodic: Axes (0, 1, 2) along which opposite faces of a box are one, and
+            :class:`Periodic` pairs of other parts of the boundary.
 
     Raises:
         SceneError: if the parts do not fit together (on all ranks).
@@ -137,11 +141,13 @@ class Scene:
     facet_tags: Any = None
     self_action: str = "consistent"
     name: str = "scene"
+    periodic: Sequence[int | Periodic] | int | Periodic = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "supports", _several(self.supports, "supports", Fix))
         object.__setattr__(self, "loads", _several(self.loads, "loads", Load))
         self._check_mesh()
+        object.__setattr__(self, "periodic", checked(self.periodic, self.mesh.geometry.dim))
         _compat.equispaced(self.mesh)
         self._check_tag_kinds()
         self._check_bodies()
@@ -161,6 +167,15 @@ class Scene:
         if isinstance(self.body, Body):
             return (self.body,)
         return tuple(self.body[tag] for tag in sorted(self.body))
+
+    @cached_property
+    def identified(self) -> Identified | None:
+        """Which nodes are one, None without periodic faces; collective when first asked for.
+
+        Raises:
+            MeshError, SceneError: if faces do not match (on all ranks).
+        """
+        return identify(self.mesh, self.periodic, self.facet_tags) if self.periodic else None
 
     @property
     def lumped(self) -> bool:
@@ -271,7 +286,8 @@ class Scene:
     def _check_tags(self) -> None:
         comm = self.mesh.comm
         error: Exception | None = None
-        for thing in (*self.supports, *self.loads):
+        pairs = [thing for thing in self.periodic if isinstance(thing, Periodic)]
+        for thing in (*self.supports, *self.loads, *pairs):
             where = thing.where
             cells = isinstance(thing, BodyForce)
             tags, kind = (self.cell_tags, "cell_tags") if cells else (self.facet_tags, "facet_tags")
