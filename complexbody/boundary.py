@@ -264,8 +264,8 @@ def initial(scene: Scene, action: Action) -> tuple[Array, Array]:
     """Initial fields and rates over geometry nodes, shapes (geometry nodes, n); collective.
 
     Raises:
-        SceneError: if an initial field has the wrong shape or non-finite values, or differs at nodes
-            that are one (on all ranks).
+        SceneError: if an initial field has the wrong shape or non-finite values, or differs at
+            nodes that are one (on all ranks).
     """
     x = np.asarray(scene.mesh.geometry.x)
     fields = np.zeros((len(x), scene.components))

@@ -141,7 +141,7 @@ class Scene:
     facet_tags: Any = None
     self_action: str = "consistent"
     name: str = "scene"
-    periodic: Sequence[int | Periodic] | int | Periodic = ()
+    periodic: Sequence[int | Periodic] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "supports", _several(self.supports, "supports", Fix))
