@@ -21,7 +21,6 @@ from complexbody.forms import (
     scaled_icosahedral_quasicrystal,
 )
 
-
 SCALED = {"C44": 1.0, "K2": 0.6, "R3": 0.4, "density": 1.0, "inertia": 0.8, "viscosity": 0.0}
 CASES = {
     "two fields of 1, 1D": ((16,), isotropic_two_field(d=1)),

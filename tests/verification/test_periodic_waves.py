@@ -2,8 +2,8 @@
 r"""Plane waves in periodic boxes: no boundary takes part, whatever the direction.
 
 With opposite faces one, every node of a lattice sees the same stencil, and Re(a e^{i(q·x − ωt)})
-with K_h(q)a = λM a and sin²(ωh/2) = h²λ/4 runs for ever if the box holds whole wavelengths. The step
-is chosen such that ωh = 2π/N: after N steps it is where it began.
+with K_h(q)a = λM a and sin²(ωh/2) = h²λ/4 runs for ever if the box holds whole wavelengths. The
+step is chosen such that ωh = 2π/N: after N steps it is where it began.
 """
 
 import numpy as np
