@@ -33,24 +33,32 @@ def sharing(numbers: Ints, index_map: Any, comm: Any) -> dict[int, list[int]]:
         return {}
     first = np.concatenate([[0], np.cumsum(comm.allgather(int(index_map.size_local)))])
     owner = np.searchsorted(first, numbers, side="right") - 1
-    none = np.zeros(0, np.int64)
-    asked = [numbers[owner == r] if r != comm.rank else none for r in range(comm.size)]
+    elsewhere = np.flatnonzero(owner != comm.rank)
+    row_of = dict(zip(numbers[elsewhere].tolist(), elsewhere.tolist(), strict=True))
+    # Rows of what this rank owns: most of its nodes, so by a table.
+    start, row = int(first[comm.rank]), np.full(int(index_map.size_local), -1, np.int64)
+    here = np.flatnonzero(owner == comm.rank)
+    row[numbers[here] - start] = here
+    asked = [numbers[elsewhere[owner[elsewhere] == r]] for r in range(comm.size)]
     ranks: dict[int, list[int]] = {}
     for rank, nodes in enumerate(comm.alltoall(asked)):
         for node in nodes:
             ranks.setdefault(int(node), []).append(rank)
-    named = np.array(list(ranks), np.int64)
-    mine = dict(zip(named.tolist(), np.isin(named, numbers).tolist(), strict=True))
     replies: list[list[tuple[int, list[int]]]] = [[] for _ in range(comm.size)]
+    shared: dict[int, list[int]] = {}
     for node, others in ranks.items():
-        everyone = sorted(set(others + ([comm.rank] if mine[node] else [])))
-        if len(everyone) > 1:
-            for rank in everyone:
-                replies[rank].append((node, everyone))
-    found = [pair for answer in comm.alltoall(replies) for pair in answer]
-    order = np.argsort(numbers)
-    rows = order[np.searchsorted(numbers, np.array([n for n, _ in found], np.int64), sorter=order)]
-    return {int(row): everyone for row, (_, everyone) in zip(rows, found, strict=True)}
+        mine = int(row[node - start])
+        everyone = sorted([*others, comm.rank] if mine >= 0 else others)
+        if len(everyone) < 2:
+            continue
+        if mine >= 0:
+            shared[mine] = everyone
+        for rank in others:
+            replies[rank].append((node, everyone))
+    for answer in comm.alltoall(replies):
+        for node, everyone in answer:
+            shared[row_of[node]] = everyone
+    return shared
 
 
 class Halo:

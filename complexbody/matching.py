@@ -158,6 +158,6 @@ def _refuse(
         )
     raise MeshError(
         f"{name}: the facet at {_at(corners[0])} has none opposite to it, though its nodes have. "
-        "Make the two faces of the same facets."
+        "Make the two faces of the same facets (gmsh: setPeriodic)."
     )
 

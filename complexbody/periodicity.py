@@ -30,7 +30,6 @@ Ints = npt.NDArray[np.int64]
 
 #: Data of one node given at several copies may differ by this share of the largest.
 SAME = 1e-9
-AXES = "xyz"
 
 
 @dataclass(frozen=True)
@@ -137,7 +136,8 @@ class Identified:
 
     def named(self, numbers: Ints, nodes: Ints) -> Ints:
         """Global numbers of geometry nodes, those of classes in the place of their copies' own."""
-        return np.where(self._classes(nodes) < 0, numbers, self.number[self._classes(nodes)])
+        classes = self._classes(nodes)
+        return np.where(classes < 0, numbers, self.number[classes])
 
     def placed(self, nodes: Ints) -> Array:
         """Coordinates of geometry nodes (nodes, 3): of the first copy of each."""
@@ -261,7 +261,7 @@ def identify(mesh: Any, periodic: Sequence[int | Periodic], tags: Any = None) ->
             vector[: len(thing.vector)] = thing.vector
         else:
             chosen, other, vector = _ends(boundary, thing)
-            name = f"periodic axis {AXES[thing]}"
+            name = f"periodic={thing}"
         found, inner = match(boundary, chosen, vector, name, other)
         pairs.append(found)
         facets.append(inner)

@@ -187,7 +187,7 @@ def _faces(problem: Problem) -> Finding:
     found, disc = problem.whole.identified, problem.disc
     assert found is not None
     nodes, count = problem.comm.allreduce(int(disc.owned.sum())), len(found.number)
-    along = ", ".join(f"axis {axis}" for axis in found.axes)
+    along = ", ".join(AXES[axis] for axis in found.axes)
     what = f"along {along}" if found.boxed else "by given vectors"
     return Finding("periodic", f"{what}: {count} of {nodes} nodes have copies",
                    "All copies of a node share its record, mass and force")  # fmt: skip
