@@ -23,6 +23,7 @@ from complexbody.linearise import Prestress, linearise, prestress
 from complexbody.momentum import angular_momentum
 from complexbody.objectivity import Objectivity, objectivity
 from complexbody.output import Output
+from complexbody.periodicity import Periodic
 from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
@@ -60,6 +61,7 @@ __all__ = [
     "Newmark",
     "Objectivity",
     "Output",
+    "Periodic",
     "PetscTS",
     "Plan",
     "PointSource",

@@ -22,6 +22,7 @@ from complexbody.errors import SceneError, agree
 from complexbody.histories import Constant, History
 from complexbody.mirrors import fixed_components, mirror_plane
 from complexbody.points import point_load
+from complexbody.predicates import mask as _mask
 from complexbody.scene import FIELDS, BodyForce, Fix, Scene
 
 Array = npt.NDArray[np.float64]
@@ -60,15 +61,15 @@ class Supports:
 def entities(scene: Scene, thing: Any) -> Ints | None:
     """Facets of this rank that a support or surface load names; None for a node predicate.
 
-    Collective.
+    Faces of a periodic scene that are one with another are no boundary. Collective.
 
     Raises:
-        SceneError: if a predicate of facets fails (on all ranks).
+        SceneError: if a predicate of facets fails, or a load is on such a face (on all ranks).
     """
     mesh, where = scene.mesh, thing.where
     exterior = _compat.exterior_facets(mesh)
     if isinstance(where, str):
-        return exterior
+        return exterior if scene.identified is None else scene.identified.outer(exterior)
     if callable(where):
         if isinstance(thing, Fix):
             return None
@@ -81,30 +82,15 @@ def entities(scene: Scene, thing: Any) -> Ints | None:
 
         found = dmesh.locate_entities_boundary(mesh, mesh.topology.dim - 1, marker)
         agree(mesh.comm, next((e for e in errors if e is not None), None))
-        return np.intersect1d(found, exterior)
-    tags = np.atleast_1d(np.asarray(where))
-    facets = scene.facet_tags.indices[np.isin(scene.facet_tags.values, tags)]
-    return facets if isinstance(thing, Fix) else np.intersect1d(facets, exterior)
-
-
-def _mask(what: str, where: Any, x: Array) -> tuple[npt.NDArray[np.bool_], Exception | None]:
-    """Where a user's predicate holds at points x (3, npts); nowhere if it fails, and why."""
-    none = np.zeros(x.shape[1], np.bool_)
-    if not x.shape[1]:
-        return none, None  # ranks without points have nothing to ask
-    try:
-        mask = np.asarray(where(x))
-    except Exception as found:  # a user's callable may fail in any way
-        return none, SceneError(
-            f"{what}: the predicate cannot be evaluated: {type(found).__name__}: {found}. Give a "
-            "function of x (3, npts) -> bool (npts,)."
-        )
-    if mask.shape != none.shape:
-        return none, SceneError(
-            f"{what}: the predicate returned shape {mask.shape} for {x.shape[1]} points. Return "
-            "one truth value per column of x."
-        )
-    return mask.astype(np.bool_), None
+    else:
+        tags = np.atleast_1d(np.asarray(where))
+        found = scene.facet_tags.indices[np.isin(scene.facet_tags.values, tags)]
+        if isinstance(thing, Fix):
+            return found
+    found = np.intersect1d(found, exterior)
+    if scene.identified is not None:
+        scene.identified.refuse_load(type(thing).__name__, found)
+    return found
 
 
 def supports(scene: Scene, action: Action) -> Supports:
@@ -112,7 +98,7 @@ def supports(scene: Scene, action: Action) -> Supports:
 
     Raises:
         SceneError: if a support selects nothing, has the wrong number of components, or clashes
-            with another one (on all ranks).
+            with another one, also across periodic faces (on all ranks).
     """
     mesh, comm = scene.mesh, scene.mesh.comm
     x = np.asarray(mesh.geometry.x)
@@ -142,6 +128,8 @@ def supports(scene: Scene, action: Action) -> Supports:
         for fix in fixes:
             error = error or _prescribe(scene, out, fix, nodes, x)
     agree(comm, error)
+    if scene.identified is not None:
+        scene.identified.join_supports(out)
     return out
 
 
@@ -310,7 +298,8 @@ def initial(scene: Scene, action: Action) -> tuple[Array, Array]:
     """Initial fields and rates over geometry nodes, shapes (geometry nodes, n); collective.
 
     Raises:
-        SceneError: if an initial field has the wrong shape or non-finite values (on all ranks).
+        SceneError: if an initial field has the wrong shape or non-finite values, or differs at
+            nodes that are one (on all ranks).
     """
     x = np.asarray(scene.mesh.geometry.x)
     fields = np.zeros((len(x), scene.components))
@@ -346,4 +335,7 @@ def initial(scene: Scene, action: Action) -> tuple[Array, Array]:
             else:
                 target[:, columns] = given
     agree(scene.mesh.comm, error)
+    if scene.identified is not None:
+        scene.identified.join_initial(fields, "fields")
+        scene.identified.join_initial(rates, "rates")
     return fields, rates

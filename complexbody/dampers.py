@@ -55,7 +55,8 @@ class Dampers:
         """Damping per lumped volume of nodes in own numbering, (nodes, n, n); collective."""
         n = disc.n
         total = np.zeros((disc.nodes, n * n))
-        total[disc.number[self.node]] = self.matrix.reshape(-1, n * n)
+        # Copies of a periodic node map to one row.
+        np.add.at(total, disc.number[self.node], self.matrix.reshape(-1, n * n))
         disc.sum_shared(total)
         total /= disc.volume[:, None]
         # Per entry: u and ν have units of their own.

@@ -30,6 +30,8 @@ AXES = "xyz"
 def invariant_axes(problem: Problem) -> list[int]:
     """Axes (0, 1, 2) of the mesh along which no field of the scene varies; collective."""
     scene, dim = problem.whole, problem.disc.dim
+    if scene.identified is not None and not scene.identified.boxed:
+        return []  # a vector may lead out of the cross-section
     if dim == 1 or not isinstance(scene.body, Body) or not problem.kernels.densities.generated[0]:
         return []
     if problem.kernels.densities.coefficients or hasattr(scene.body.density, "function_space"):
@@ -139,6 +141,8 @@ def _at_ends(fix: Fix, x: Array, axis: int, low: float, high: float) -> bool:
 
 def _ends(problem: Problem, axis: int) -> bool:
     """Whether H lets fields be even along the axis, with what is held at both ends at zero."""
+    if problem.whole.identified is not None and axis in problem.whole.identified.axes:
+        return True  # there are none
     low, high = _range(problem, axis)
     tiny, n, comm = 1e-9 * (high - low), problem.disc.n, problem.comm
     x, fixed = problem.whole.mesh.geometry.x[:, axis], problem.supports.fixed

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from complexbody.conditions import FIELDS, Absorb, PointSource, Symmetry, Value,
 from complexbody.errors import MeshError, SceneError, agree
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
+from complexbody.periodicity import Identified, Periodic, checked, identify
 
 __all__ = [
     "FIELDS", "Absorb", "BodyForce", "Fix", "Initial", "PointSource", "Pressure", "Scene",
@@ -123,6 +125,8 @@ class Scene:
             "lumped" by the vertex rule; "implicit" lumps it and steps over it where it is faster
             than waves across a cell (:mod:`complexbody.stiffness`).
         name: What to call it in tables and files.
+        periodic: Axes (0, 1, 2) along which opposite faces of a box are one, and
+            :class:`Periodic` pairs of other parts of the boundary.
 
     Raises:
         SceneError: if the parts do not fit together (on all ranks).
@@ -139,12 +143,14 @@ class Scene:
     self_action: str = "consistent"
     name: str = "scene"
     absorbing: Sequence[Absorb] = ()
+    periodic: Sequence[int | Periodic] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "supports", _several(self.supports, "supports", Fix | Symmetry))
         object.__setattr__(self, "loads", _several(self.loads, "loads", Load))
         object.__setattr__(self, "absorbing", _several(self.absorbing, "absorbing", Absorb))
         self._check_mesh()
+        object.__setattr__(self, "periodic", checked(self.periodic, self.mesh.geometry.dim))
         _compat.equispaced(self.mesh)
         self._check_tag_kinds()
         self._check_bodies()
@@ -164,6 +170,15 @@ class Scene:
         if isinstance(self.body, Body):
             return (self.body,)
         return tuple(self.body[tag] for tag in sorted(self.body))
+
+    @cached_property
+    def identified(self) -> Identified | None:
+        """Which nodes are one, None without periodic faces; collective when first asked for.
+
+        Raises:
+            MeshError, SceneError: if faces do not match (on all ranks).
+        """
+        return identify(self.mesh, self.periodic, self.facet_tags) if self.periodic else None
 
     @property
     def lumped(self) -> bool:
@@ -274,7 +289,8 @@ class Scene:
     def _check_tags(self) -> None:
         comm = self.mesh.comm
         error: Exception | None = None
-        for thing in (*self.supports, *self.loads, *self.absorbing):
+        pairs = [thing for thing in self.periodic if isinstance(thing, Periodic)]
+        for thing in (*self.supports, *self.loads, *self.absorbing, *pairs):
             if isinstance(thing, PointSource):
                 continue
             where = thing.where

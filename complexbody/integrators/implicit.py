@@ -22,6 +22,7 @@ from complexbody.integrators.implicit_run import ImplicitRun
 from complexbody.integrators.split_run import SplitRun
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.periodicity import require_unrepeated
 from complexbody.problem import Problem
 from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import HELD, critical_step, require_constant_inertia
@@ -137,6 +138,7 @@ class Implicit:
             )
         critical = self._critical(problem, scheme)
         if self.quadrature == "consistent":
+            require_unrepeated(problem.scene, "Implicit(quadrature='consistent')")
             # A cell's consistent mass is at least its lumped one over d + 2.
             critical /= float(np.sqrt(problem.disc.dim + 2))
         limit = problem.kinetic_range.limit(self.order)

@@ -236,7 +236,7 @@ class ImplicitRun(ForceRun):
         nu, disc = problem.scene.components_of("nu"), problem.disc
         values = np.zeros((2, len(problem.scene.mesh.geometry.x), len(nu)))
         for out, records in zip(values, (problem.kernels.x, rates), strict=True):
-            out[disc.dof] = records[:-1, nu]
+            disc.spread(records[:-1, nu], out)
         try:
             measured = problem.convexity.measure(*values)
         except BodyError as error:

@@ -259,20 +259,19 @@ class Message:
 
     def __init__(self, problem: Problem, touched: npt.NDArray[np.bool_]) -> None:
         disc, index_map = problem.disc, _compat.node_map(problem.scene.mesh)
-        mine = np.zeros(_compat.node_count(problem.scene.mesh), np.bool_)
-        mine[disc.dof[touched]] = True
-        ranks = sharing(index_map, mine, problem.comm)
-        dofs = np.array(sorted(ranks), dtype=np.int32)
-        order = np.asarray(index_map.local_to_global(dofs)) if len(dofs) else np.zeros(0, np.int64)
-        shared = {i: ranks[int(dof)] for i, dof in enumerate(dofs)}
-        self.halo = halo = Halo(problem.comm, shared, order, disc.record)
-        self.node, f = disc.number[dofs].astype(np.int32), native.pointer(problem.kernels.f)
+        nodes = np.flatnonzero(touched)
+        names = disc.names(disc.dof[nodes])
+        ranks = sharing(names, index_map, problem.comm)
+        rows = np.array(sorted(ranks), dtype=np.int64)
+        shared = {i: ranks[int(row)] for i, row in enumerate(rows)}
+        self.halo = halo = Halo(problem.comm, shared, names[rows], disc.record)
+        self.node, f = nodes[rows].astype(np.int32), native.pointer(problem.kernels.f)
         self._pack = (
             ctypes.c_int64(len(halo.sends)), native.pointer(halo.sends), native.pointer(self.node),
             f, native.pointer(halo.outgoing),
         )  # fmt: skip
         self._add = (
-            ctypes.c_int64(len(dofs)), native.pointer(self.node), native.pointer(halo.start),
+            ctypes.c_int64(len(rows)), native.pointer(self.node), native.pointer(halo.start),
             native.pointer(halo.source), native.pointer(halo.incoming), f,
         )  # fmt: skip
 

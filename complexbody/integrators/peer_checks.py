@@ -10,6 +10,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from complexbody.errors import IntegratorError, StepError
+from complexbody.periodicity import require_unrepeated
 from complexbody.problem import Problem
 from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import critical_step, require_constant_inertia
@@ -19,9 +20,10 @@ def require(method: Any, problem: Problem) -> str:
     """Refuse what no peer takes; the peer's name.
 
     Raises:
-        IntegratorError: for general χ, and self-action that is not integrated in full.
+        IntegratorError: for periodic scenes, general χ, and self-action not integrated in full.
     """
     name = type(method).__name__
+    require_unrepeated(problem.scene, name)
     require_constant_inertia(problem, name)
     require_explicit_self_action(problem.scene, name)
     if problem.scene.lumped:

@@ -273,7 +273,7 @@ class Kernels:
         vector = np.zeros(len(action.q.x.array))
         fem.assemble_vector(vector, _compat.form(ufl.derivative(total, action.q, action.v)))
         self.constant = native.aligned(self.f.shape)
-        self.constant[:-1, : self.n] = -self.disc.gather(vector.reshape(-1, self.n))
+        self.constant[:-1, : self.n] = -self.disc.gather_sum(vector.reshape(-1, self.n))
         self.state.constant = self.constant.ctypes.data
 
     def reset_forces(self) -> None:

@@ -63,6 +63,7 @@ __attribute__((unused)) static void tabulated_lone(const tabulated *force, const
   for (int l = 0; l < count; l++) {
     tabulated one = *force; /* this cell's pack where lane l's would be */
     one.pack += (cell[l] - l) * (force->before + force->after);
+    if (one.corners) one.corners += 3 * (DIM + 1) * (int64_t)(cell[l] - l);
     tabulated_input(&one, 0, l, c, s->record, RECORD, s->coordinates, w, at);
     for (int pass = 0; pass <= CORRECTED; pass++) {
       memset(f, 0, sizeof f);
