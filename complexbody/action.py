@@ -21,7 +21,7 @@ from dolfinx import fem
 from complexbody import _compat
 from complexbody.body import Body
 from complexbody.densities import scalar
-from complexbody.errors import SceneError
+from complexbody.errors import BodyError, SceneError, agree
 from complexbody.scene import BodyForce, Pressure, Scene, Traction
 
 
@@ -72,6 +72,21 @@ class Action:
             return None
         u, nu, _, _ = self.fields(q)
         return scalar(f"potential of {body.name}", body.potential, u, nu)
+
+    def check_densities(self) -> None:
+        """Evaluate all densities once, before anything relies on them; collective.
+
+        Raises:
+            BodyError: if one fails on any rank (on all ranks).
+        """
+        error: Exception | None = None
+        try:
+            for body in self.scene.bodies:
+                self.stored_density(body, self.q)
+                self.potential_density(body, self.q)
+        except BodyError as found:
+            error = found
+        agree(self.scene.mesh.comm, error)
 
     def measure(self, number: int) -> Any:
         """The volume measure on region ``number``: one body may fill several regions."""

@@ -48,6 +48,8 @@ class Body:
             one UFL estimates.
         name: What to call it in tables and messages.
         constants: The constants it was made of, by name, for tables and result files.
+        orientation: Stop a run in which a cell turns inside out, det(I + ∇u) ≤ 0; asked only of
+            energies that are not quadratic in U. False for those that mean something there.
 
     Raises:
         BodyError: for shapes, signs or values that no body can have.
@@ -63,6 +65,7 @@ class Body:
     quadrature_degree: int | None = None
     name: str = "body"
     constants: Mapping[str, float] = field(default_factory=dict)
+    orientation: bool = True
 
     def __post_init__(self) -> None:
         for name in ("descriptor", "displacement"):

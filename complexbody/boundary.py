@@ -25,8 +25,59 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[Any]  # int32 from dolfinx, int64 from numpy
 
 
+class Amplitudes:
+    """Factors of a user's histories, any of which may fail at any time.
+
+    A rank that raised alone in mid-run would leave the others waiting: here it goes on with NaN,
+    which the next ledger row finds on all ranks.
+
+    Attributes:
+        failure: What the first failure on this rank was.
+    """
+
+    failure: SceneError | None = None
+
+    def factors(self, history: History, times: Array) -> Array:
+        """Factors at the times [s], shape (times,); NaN where they cannot be had."""
+        try:
+            out = np.asarray(history(times), dtype=np.float64)
+            if out.shape in ((), times.shape):
+                if not np.all(np.isfinite(out)):
+                    worst = times[np.flatnonzero(~np.isfinite(np.broadcast_to(out, times.shape)))]
+                    self._failed(f"is not finite at t = {worst[0]:.6g} s")
+                return out
+            self._failed(f"returned shape {out.shape} for times of shape {times.shape}")
+        except Exception as found:  # a user's callable may fail in any way
+            self._failed(f"cannot be evaluated: {type(found).__name__}: {found}")
+        return np.full(times.shape, np.nan)
+
+    def _failed(self, what: str) -> None:
+        if self.failure is None:
+            self.failure = SceneError(
+                f"The history of a load or support {what}. Give a function of an array of times "
+                "[s] that returns finite factors of the same shape."
+            )
+
+
+#: Times at which histories are tried before a run.
+TRIED = 257
+
+
+def try_histories(comm: Any, histories: list[History], until: float) -> None:
+    """Evaluate histories at many times of a run, before it; collective.
+
+    Raises:
+        SceneError: if one fails, misfits or is not finite, on any rank (on all ranks).
+    """
+    amplitudes = Amplitudes()
+    for history in histories:
+        for times in (np.linspace(0.0, until, TRIED), np.zeros(1)):
+            amplitudes.factors(history, times)
+    agree(comm, amplitudes.failure)
+
+
 @dataclass
-class Supports:
+class Supports(Amplitudes):
     """Prescribed components of this rank's geometry nodes.
 
     Attributes:
@@ -48,7 +99,8 @@ class Supports:
 
     def targets(self, rows: Any, columns: Any, t: float) -> Array:
         """Prescribed values of entries (rows, columns) at time t [s]."""
-        factors = np.array([float(h(t)) for h in self.histories])
+        at = np.array([t], dtype=np.float64)
+        factors = np.concatenate([np.atleast_1d(self.factors(h, at)) for h in self.histories])
         return self.value[rows, columns] * factors[self.history[rows, columns]]
 
 
@@ -131,6 +183,7 @@ def supports(scene: Scene, action: Action) -> Supports:
             )
         error = error or _prescribe(scene, out, fix, nodes, x)
     agree(comm, error)
+    try_histories(comm, out.histories, 0.0)
     return out
 
 
@@ -195,7 +248,7 @@ def _values(value: Any, points: Array, count: int) -> Array | None:
 
 
 @dataclass
-class Loads:
+class Loads(Amplitudes):
     """Partial load vectors of this rank: entry i adds ``factor[group[i]]·value[i]`` at its node.
 
     Attributes:
@@ -216,7 +269,7 @@ class Loads:
         """Factors at the times [s], shape (times, groups)."""
         out = np.ones((len(times), max(len(self.histories), 1)))
         for i, history in enumerate(self.histories):
-            out[:, i] = np.asarray(history(times), dtype=np.float64)
+            out[:, i] = self.factors(history, times)
         return out
 
 
@@ -268,6 +321,7 @@ def loads(scene: Scene, action: Action) -> Loads:
     if not rows:
         empty = np.zeros(0, np.int64)
         return Loads(empty, empty, empty.astype(np.int32), np.zeros(0), [])
+    try_histories(comm, histories, 0.0)
     node, component, group, value = (np.concatenate(c) for c in zip(*rows, strict=True))
     return Loads(node.astype(np.int64), component.astype(np.int64), group, value, histories)
 

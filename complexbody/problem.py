@@ -68,6 +68,7 @@ class Problem:
     def __init__(self, scene: Scene, reduce: bool = False) -> None:
         self.scene, self.whole, self.comm = scene, scene, scene.mesh.comm
         self.action = self.whole_action = Action(scene)
+        self.action.check_densities()
         dofs = _compat.cell_dofs(self.action.space)
         # All layers below rely on one numbering of nodes and P1 degrees of freedom.
         assert np.array_equal(dofs, _compat.cell_nodes(scene.mesh))

@@ -15,7 +15,7 @@ import numpy as np
 
 from complexbody import _compat
 from complexbody.body import Body
-from complexbody.errors import MeshError, SceneError, agree
+from complexbody.errors import BodyError, MeshError, SceneError, agree
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
 
@@ -252,11 +252,19 @@ class Scene:
 
     def _recognise(self) -> None:
         """Give bodies whose χ(ν, ν̇) is ½ν̇·Ων̇ that Ω for their inertia."""
-        if isinstance(self.body, Body):
-            object.__setattr__(self, "body", recognised(self.body, self.mesh))
-        elif any(callable(body.inertia) for body in self.body.values()):
-            known = {tag: recognised(body, self.mesh) for tag, body in self.body.items()}
-            object.__setattr__(self, "body", known)
+        if not any(callable(body.inertia) for body in self.bodies):
+            return
+        known: Any = None
+        error: Exception | None = None
+        try:
+            if isinstance(self.body, Body):
+                known = recognised(self.body, self.mesh)
+            else:
+                known = {tag: recognised(body, self.mesh) for tag, body in self.body.items()}
+        except BodyError as found:
+            error = found
+        agree(self.mesh.comm, error)
+        object.__setattr__(self, "body", known)
 
     def _check_tag_kinds(self) -> None:
         cell = self.mesh.topology.dim

@@ -16,7 +16,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import planning
-from complexbody.errors import SceneError, SolverError
+from complexbody.boundary import try_histories
+from complexbody.errors import DivergenceError, SceneError, SolverError, StepError, agree
 from complexbody.files import CsvWriter
 from complexbody.instabilities import warn_of
 from complexbody.integrators.asynchronous import AVI
@@ -97,6 +98,10 @@ def require_until(until: float) -> None:
         raise SceneError(f"simulate: until is {until}. Give the end of the run in seconds, > 0.")
 
 
+#: Whole numbers up to here are floats, so that t = n h is exact to round-off.
+MOST_STEPS = 2.0**53
+
+
 class Watch(Protocol):
     """Who looks at a run as it goes; may raise to end it.
 
@@ -145,12 +150,14 @@ class Simulation:
         self.watch = watch
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
+        for data in (self.problem.loads, self.problem.supports):
+            try_histories(self.comm, data.histories, until)
         warn_of(self.problem, method, until)
         self.problem.quiet = plan if quiet is None else quiet
         self.run_: Run = method.prepare(self.problem, until)
         self.problem.release()
         self.plan = planning.of_run(self.problem, method) if plan else None
-        self.last = int(np.ceil(until / self.run_.step - 1e-9))
+        self.last = _steps(until, self.run_.step)
         self.times = output.schedule(until) if output is not None else np.zeros(0)
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
         self.writer = Writer(self.problem.whole_action, output) if output is not None else None
@@ -194,6 +201,7 @@ class Simulation:
 
         Raises:
             DivergenceError: if the run blew up.
+            SceneError: if a history of the scene failed on the way.
             SolverError: if an implicit step has no solution; the last state is written as output,
                 and is ``result`` of the error.
             OutputError: if results cannot be written any more.
@@ -201,8 +209,12 @@ class Simulation:
         try:
             self._loop()
             return self._result()
-        except SolverError as error:
-            error.result = self._keep()
+        except (DivergenceError, SolverError) as error:
+            # A history that failed on some rank since the last row gave it NaN.
+            for data in (self.problem.loads, self.problem.supports):
+                agree(self.comm, data.failure)
+            if isinstance(error, SolverError):
+                error.result = self._keep()
             raise
         finally:
             self._close()
@@ -356,6 +368,21 @@ class Simulation:
                 thing.close()
         self.run_.close()
         self.problem.close()
+
+
+def _steps(until: float, step: float) -> int:
+    """Steps of a run.
+
+    Raises:
+        StepError: for more than a clock of whole steps can count to the last one.
+    """
+    steps = np.ceil(until / step - 1e-9)
+    if not steps < MOST_STEPS:
+        raise StepError(
+            f"The run would take {steps:.3g} steps of {step:.3g} s. Give a larger step, or an "
+            "earlier end."
+        )
+    return int(steps)
 
 
 def default_ledger_steps(cells: int, ranks: int, steps: int) -> int:
