@@ -22,6 +22,7 @@ from complexbody import _compat
 from complexbody.body import Body
 from complexbody.densities import scalar
 from complexbody.errors import BodyError, SceneError, agree
+from complexbody.given import is_finite, short
 from complexbody.scene import BodyForce, Pressure, Scene, Traction
 
 
@@ -157,9 +158,11 @@ class Action:
         v = ufl.as_vector([self.v[int(i)] for i in rows])
         if isinstance(load, Pressure):
             normal, dim = ufl.FacetNormal(scene.mesh), scene.mesh.geometry.dim
+            if not is_finite(load.pressure):
+                raise SceneError(
+                    f"Pressure: pressure is {short(load.pressure)}. Give a finite number in Pa."
+                )
             p = float(load.pressure)
-            if not np.isfinite(p):
-                raise SceneError(f"Pressure: pressure is {p}. Give a finite number in Pa.")
             # A Constant, so that the form compiles once for all values.
             pressure = fem.Constant(scene.mesh, p)
             vector = ufl.as_vector(

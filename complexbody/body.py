@@ -7,7 +7,6 @@ integrator. Its energy is a function of UFL expressions, evaluated when a scene 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -16,14 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody.errors import BodyError
+from complexbody.given import is_finite, is_number, is_whole, numbers, short
 
 Number = float | int
 Matrix = npt.NDArray[np.float64]
 
 #: More components, or points of quadrature, are a mistake: kernels would take for ever to compile.
 MOST_COMPONENTS, MOST_DEGREE = 1000, 40
-#: Letters of a value in a message.
-LONGEST = 100
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class Body:
     def __post_init__(self) -> None:
         for name in ("descriptor", "displacement"):
             value = getattr(self, name)
-            if not (_is_whole(value) and 1 <= value <= MOST_COMPONENTS):
+            if not (is_whole(value) and 1 <= value <= MOST_COMPONENTS):
                 raise BodyError(
                     f"Body: {name} is {short(value)}, not a whole number of components. "
                     f"Give {name}=1 or more."
@@ -116,7 +114,7 @@ class Body:
     def _check_manners(self) -> None:
         """What no equation sees."""
         degree = self.quadrature_degree
-        if degree is not None and not (_is_whole(degree) and 0 <= degree <= MOST_DEGREE):
+        if degree is not None and not (is_whole(degree) and 0 <= degree <= MOST_DEGREE):
             raise BodyError(
                 f"Body: quadrature_degree is {short(degree)}. Give None or a whole number from 0 "
                 f"to {MOST_DEGREE}."
@@ -154,16 +152,12 @@ class Body:
 
     def _square(self, name: str, value: Any) -> Matrix:
         k = int(self.descriptor)
-        try:
-            array = np.asarray(value)
-        except (TypeError, ValueError):  # rows of several lengths
-            array = np.asarray(None)
         # Texts, truth values and complex numbers would be converted without a word.
-        if array.dtype.kind not in "iuf" or isinstance(value, np.ma.MaskedArray):
+        array = numbers(value)
+        if array is None:
             raise BodyError(
                 f"Body: {name} is {short(value)}. Give a number or a {k}×{k} matrix of numbers."
             )
-        array = array.astype(np.float64)
         if array.ndim == 0:
             return np.diag(np.full(k, float(array)))
         if array.shape != (k, k):
@@ -172,33 +166,6 @@ class Body:
                 f"Give a number or a {k}×{k} matrix."
             )
         return array
-
-
-def is_number(value: Any) -> bool:
-    """Whether this is a real number (truth values are none)."""
-    real = int | float | np.integer | np.floating
-    return isinstance(value, real) and not isinstance(value, bool)
-
-
-def is_finite(value: Any) -> bool:
-    """Whether this is a number that a float can hold."""
-    try:
-        return is_number(value) and math.isfinite(value)
-    except OverflowError:  # an integer of hundreds of digits
-        return False
-
-
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
-
-
-def short(value: Any) -> str:
-    """A value in a message: its text, cut where it is long."""
-    try:
-        text = repr(value)
-    except Exception:  # of an object that has none, or too many digits
-        text = f"a {type(value).__name__}"
-    return text if len(text) <= LONGEST else text[: LONGEST - 1] + "…"
 
 
 def _scaled(matrix: Matrix) -> Matrix:

@@ -18,6 +18,7 @@ from dolfinx import mesh as dmesh
 from complexbody import _compat
 from complexbody.action import Action
 from complexbody.errors import SceneError, agree
+from complexbody.given import numbers
 from complexbody.histories import Constant, History
 from complexbody.scene import FIELDS, BodyForce, Fix, Scene
 
@@ -40,13 +41,16 @@ class Amplitudes:
     def factors(self, history: History, times: Array) -> Array:
         """Factors at the times [s], shape (times,); NaN where they cannot be had."""
         try:
-            out = np.asarray(history(times), dtype=np.float64)
-            if out.shape in ((), times.shape):
+            out = numbers(history(times))
+            if out is None:
+                self._failed("returned no real numbers")
+            elif out.shape in ((), times.shape):
                 if not np.all(np.isfinite(out)):
                     worst = times[np.flatnonzero(~np.isfinite(np.broadcast_to(out, times.shape)))]
                     self._failed(f"is not finite at t = {worst[0]:.6g} s")
                 return out
-            self._failed(f"returned shape {out.shape} for times of shape {times.shape}")
+            else:
+                self._failed(f"returned shape {out.shape} for times of shape {times.shape}")
         except Exception as found:  # a user's callable may fail in any way
             self._failed(f"cannot be evaluated: {type(found).__name__}: {found}")
         return np.full(times.shape, np.nan)
@@ -151,6 +155,11 @@ def _mask(what: str, where: Any, x: Array) -> tuple[npt.NDArray[np.bool_], Excep
             f"{what}: the predicate returned shape {mask.shape} for {x.shape[1]} points. Return "
             "one truth value per column of x."
         )
+    if mask.dtype.kind not in "biu":
+        return none, SceneError(
+            f"{what}: the predicate returned values of type {mask.dtype}, no truth values. Return "
+            "one truth value per column of x."
+        )
     return mask.astype(np.bool_), None
 
 
@@ -236,13 +245,17 @@ def _values(value: Any, points: Array, count: int) -> Array | None:
     """Values (points, count) of a number, a sequence or a callable of x; None if they misfit."""
     if not len(points):
         return np.zeros((0, count))  # ranks without points have nothing to ask
+    found = value(points.T) if callable(value) else value
+    mask = callable(value) and np.asarray(found).dtype == np.bool_  # a predicate means 0 and 1
+    given = numbers(np.asarray(found, dtype=np.int64) if mask else found)
+    if given is None:
+        return None
     try:
         if callable(value):
-            given = np.asarray(value(points.T), dtype=np.float64)
             given = np.broadcast_to(np.atleast_2d(given), (count, len(points))).T
         else:
-            given = np.broadcast_to(np.asarray(value, dtype=np.float64), (len(points), count))
-    except (TypeError, ValueError):
+            given = np.broadcast_to(given, (len(points), count))
+    except ValueError:
         return None
     return given if np.all(np.isfinite(given)) else None
 

@@ -12,8 +12,8 @@ from ufl.algorithms.analysis import extract_arguments
 from ufl.classes import Condition, ScalarValue
 from ufl.corealg.traversal import unique_pre_traversal
 
-from complexbody.body import short
 from complexbody.errors import BodyError
+from complexbody.given import short
 
 
 def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:

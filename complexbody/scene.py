@@ -16,6 +16,7 @@ import numpy as np
 from complexbody import _compat
 from complexbody.body import Body
 from complexbody.errors import BodyError, MeshError, SceneError, agree
+from complexbody.given import is_whole, short
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
 
@@ -149,9 +150,12 @@ class Scene:
         self._check_tags()
         if not isinstance(self.initial, Initial):
             raise SceneError("Scene: initial is not an Initial. Give initial=cb.Initial(u=…).")
-        if self.self_action not in ("consistent", "lumped", "implicit"):
+        if not isinstance(self.name, str):
+            raise SceneError(f"Scene: name is {short(self.name)}. Give a text.")
+        known = ("consistent", "lumped", "implicit")
+        if not isinstance(self.self_action, str) or self.self_action not in known:
             raise SceneError(
-                f"Scene: self_action is {self.self_action!r}. Give 'consistent', 'lumped' or "
+                f"Scene: self_action is {short(self.self_action)}. Give 'consistent', 'lumped' or "
                 "'implicit'."
             )
 
@@ -221,6 +225,11 @@ class Scene:
         if not isinstance(self.body, Mapping) or not self.body:
             raise SceneError(
                 "Scene: body is neither a Body nor {cell tag: Body}. Give one of them."
+            )
+        if not all(is_whole(tag) for tag in self.body):
+            raise SceneError(
+                f"Scene: a tag of body={{tag: …}} is no whole number: {short(list(self.body))}. "
+                "Give the tags of cell_tags."
             )
         if not all(isinstance(body, Body) for body in self.body.values()):
             raise SceneError("Scene: a value of body={tag: …} is not a Body. Give Body objects.")

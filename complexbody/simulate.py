@@ -17,8 +17,16 @@ from mpi4py import MPI
 
 from complexbody import planning
 from complexbody.boundary import try_histories
-from complexbody.errors import DivergenceError, SceneError, SolverError, StepError, agree
+from complexbody.errors import (
+    DivergenceError,
+    IntegratorError,
+    SceneError,
+    SolverError,
+    StepError,
+    agree,
+)
 from complexbody.files import CsvWriter
+from complexbody.given import is_flag, is_positive, is_whole, short
 from complexbody.instabilities import warn_of
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
@@ -81,6 +89,8 @@ def simulate(
         "until": until, "output": output, "ledger_steps": ledger_steps, "growth": growth,
         "progress": progress, "plan": plan, "quiet": quiet,
     }  # fmt: skip
+    if not isinstance(scene, Scene):
+        raise SceneError(f"simulate: the scene is {short(scene)}. Give a cb.Scene.")
     if accuracy is None:
         return Simulation(scene, integrator, **options).run()
     from complexbody.accuracy import Accurate  # it stands above: it makes simulations
@@ -88,16 +98,38 @@ def simulate(
     return Accurate(scene, accuracy, integrator, **options).run()
 
 
-def require_until(until: float) -> None:
-    """Refuse what is no end of a run.
+def check_options(
+    *,
+    until: Any,
+    output: Any = None,
+    ledger_steps: Any = None,
+    growth: Any = None,
+    **flags: Any,
+) -> None:
+    """Refuse options of :func:`simulate` that make no sense.
 
     Raises:
-        SceneError: for it.
+        SceneError: for the first of them.
     """
-    if not (np.isfinite(until) and until > 0):
-        raise SceneError(f"simulate: until is {until}. Give the end of the run in seconds, > 0.")
+    if not is_positive(until):
+        raise SceneError(
+            f"simulate: until is {short(until)}. Give the end of the run in seconds, > 0."
+        )
+    if output is not None and not isinstance(output, Output):
+        raise SceneError(f"simulate: output is {short(output)}. Give cb.Output(folder, …).")
+    if ledger_steps is not None and not (is_whole(ledger_steps) and ledger_steps > 0):
+        raise SceneError(
+            f"simulate: ledger_steps is {short(ledger_steps)}. Give a whole number, 1 or more."
+        )
+    if growth is not None and not is_positive(growth):
+        raise SceneError(f"simulate: growth is {short(growth)}. Give a number > 0, or None.")
+    for name, value in flags.items():
+        if name in FLAGS and not (is_flag(value) or (value is None and name != "plan")):
+            raise SceneError(f"simulate: {name} is {short(value)}. Give True or False.")
 
 
+#: Options of a simulation that are True or False.
+FLAGS = ("progress", "plan", "quiet")
 #: Whole numbers up to here are floats, so that t = n h is exact to round-off.
 MOST_STEPS = 2.0**53
 
@@ -143,10 +175,16 @@ class Simulation:
         watch: Watch | None = None,
     ) -> None:
         begun = clock.perf_counter()
-        require_until(until)
-        if ledger_steps is not None and ledger_steps < 1:
-            raise SceneError(f"simulate: ledger_steps is {ledger_steps}. Give 1 or more.")
-        self.method = method = integrator or Synchronous()
+        check_options(
+            until=until, output=output, ledger_steps=ledger_steps, growth=growth,
+            progress=progress, plan=plan, quiet=quiet,
+        )  # fmt: skip
+        integrator = Synchronous() if integrator is None else integrator
+        if not isinstance(integrator, Integrator):
+            raise IntegratorError(
+                f"simulate: integrator is {short(integrator)}. Give one, such as cb.AVI()."
+            )
+        self.method = method = integrator
         self.watch = watch
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
