@@ -7,8 +7,10 @@ advice; or, where it turns out to be none, in finite numbers.
 import contextlib
 import fractions
 import io
+import json
 import os
 import re
+import shutil
 import signal
 import time
 import warnings
@@ -19,6 +21,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
 
+from complexbody.cli import main
 from complexbody.errors import ComplexBodyError
 
 #: Seconds that one case may take, compiling included.
@@ -150,3 +153,41 @@ not_a_count = st.one_of(
     st.integers(max_value=0), no_numbers, wild, st.sampled_from([1.5, 2.0, "2", np.float64(3)])
 )
 failing = st.sampled_from(FAILING)
+
+#: A scene file that runs.
+GOOD = '''
+import numpy as np
+import complexbody as cb
+import ufl
+from complexbody import meshes
+from complexbody.forms import isotropic_two_field
+
+DEFAULTS = dict(until=0.02, every=0.01)
+history, where, load, start = cb.constant(), (lambda x: x[0] < 1e-9), (1.0,), None
+
+def scene(comm, cells=8):
+    return cb.Scene(
+        meshes.interval(comm, 0.0, 1.0, cells), isotropic_two_field(d=1),
+        supports=[cb.Fix("u", where=where)], loads=[cb.BodyForce(load, history=history)],
+        initial=cb.Initial(u=start),
+    )
+'''
+
+
+def judged(words, out):
+    """Run main, and judge its end; the exit code."""
+    shutil.rmtree(out, ignore_errors=True)
+    with silent() as (_, err), limited():
+        code = main(words)
+    told = err.getvalue()
+    assert code in (0, 2, 3, 4, 5, 130), told
+    assert "Traceback" not in told, told
+    if code == 0:
+        return code
+    assert "complexbody: " in told and told.endswith("\n")
+    record = out / "run.json"
+    if record.exists():
+        assert json.loads(record.read_text())["state"] != "finished"
+    else:
+        assert not list(out.glob("*")) if out.exists() else True
+    return code

@@ -187,7 +187,7 @@ def test_supports_that_overlap(comm):
 
 def _on_last_rank(comm, function):
     """A callable that works but on the last rank, where it calls ``function``."""
-    return lambda x: function(x) if comm.rank == comm.size - 1 else np.zeros(x.shape[1])
+    return lambda x: function(x) if comm.rank == comm.size - 1 else np.zeros(x.shape[1], bool)
 
 
 def _fail(x):
