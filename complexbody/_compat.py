@@ -209,6 +209,15 @@ def petsc_vector(function: fem.Function) -> Any:
     return function.x.petsc_vec if hasattr(function.x, "petsc_vec") else function.vector
 
 
+def free_vector(function: fem.Function) -> None:
+    """Destroy the Vec of :func:`petsc_vector`, if there is one: dolfinx 0.5 never does."""
+    for holder in (function, function.x):
+        vector = getattr(holder, "_petsc_x", None)
+        if vector is not None:
+            vector.destroy()
+            holder._petsc_x = None
+
+
 def mesh_from_gmsh(model: Any, comm: Any, rank: int = 0, gdim: int = 3) -> tuple[Any, Any, Any]:
     """Mesh, cell tags and facet tags of a gmsh model that ``rank`` holds; collective."""
     # Not imported by dolfinx.io itself: it needs gmsh.
