@@ -23,6 +23,7 @@ from complexbody.assumptions import check_energy, hessian_samples
 from complexbody.body import Body
 from complexbody.convexity import Convexity, Range
 from complexbody.discretisation import Discretisation
+from complexbody.errors import CoercivityError
 from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
@@ -80,7 +81,11 @@ class Problem:
         self.quiet = True
         self.known_steps: dict[str, Array] = {}
         self.arrange()
-        self.warnings = check_energy(self)
+        try:
+            self.warnings = check_energy(self)
+        except CoercivityError:  # which all ranks have: closing is collective
+            self.close()
+            raise
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
         self.full: Problem = self
         if reduce:

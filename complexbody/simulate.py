@@ -18,6 +18,7 @@ from mpi4py import MPI
 from complexbody import planning
 from complexbody.boundary import try_histories
 from complexbody.errors import (
+    ComplexBodyError,
     DivergenceError,
     IntegratorError,
     SceneError,
@@ -184,17 +185,34 @@ class Simulation:
             raise IntegratorError(
                 f"simulate: integrator is {short(integrator)}. Give one, such as cb.AVI()."
             )
-        self.method = method = integrator
+        self.method = integrator
         self.watch = watch
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
+        try:
+            self._make_ready(plan, quiet, ledger_steps, growth, progress)
+        except ComplexBodyError:  # which all ranks have: closing is collective
+            self.problem.close()
+            raise
+        self.stats.set_up = clock.perf_counter() - begun
+
+    def _make_ready(
+        self,
+        plan: bool,
+        quiet: bool | None,
+        ledger_steps: int | None,
+        growth: float | None,
+        progress: bool | None,
+    ) -> None:
+        """All but the problem itself."""
+        until, output = self.until, self.output
         for data in (self.problem.loads, self.problem.supports):
             try_histories(self.comm, data.histories, until)
-        warn_of(self.problem, method, until)
+        warn_of(self.problem, self.method, until)
         self.problem.quiet = plan if quiet is None else quiet
-        self.run_: Run = method.prepare(self.problem, until)
+        self.run_: Run = self.method.prepare(self.problem, until)
         self.problem.release()
-        self.plan = planning.of_run(self.problem, method) if plan else None
+        self.plan = planning.of_run(self.problem, self.method) if plan else None
         self.last = _steps(until, self.run_.step)
         self.times = output.schedule(until) if output is not None else np.zeros(0)
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
@@ -218,7 +236,6 @@ class Simulation:
         self.every = ledger_steps or default_ledger_steps(
             self.stats.cells, self.comm.size, self.last
         )
-        self.stats.set_up = clock.perf_counter() - begun
 
     def _steps(self) -> dict[str, Array]:
         """Step and level of each of this rank's cells."""
