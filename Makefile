@@ -18,7 +18,7 @@ MPI_PYTEST := $(PYTEST) --color=no -p no:cacheprovider -o faulthandler_timeout=2
 # nproc obeys OMP_NUM_THREADS, which is 1 here.
 RANKS := $(shell n=$$(env -u OMP_NUM_THREADS nproc); echo $$((n < 2 ? n : 2)))
 
-.PHONY: help setup demo charts test verify test-debian13 lint clean
+.PHONY: help setup demo charts test verify test-debian13 docs lint clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -35,17 +35,17 @@ demo: setup ## an impact, computed and drawn (results/impact)
 # On graded meshes peers get more time per point first, else hardly any would be on the finest.
 CHART = $(PYTHON) -m complexbody chart benchmarks/scenes/$(1).py --out docs/charts/$(1)
 PEERS = --methods assembly,matrix,petsc-rk4,petsc-alpha2,petsc-cn,newmark \
-	--steps 2 --budget 15 --repeats 1
+	--steps 2 --repeats 1 --budget
 NOTCH = --meshes refine=0.3,0.5,0.8
 PLATE = --meshes refine=0.3,0.45,0.6
 
-charts: setup ## speed against accuracy on four scenes (docs/charts), serially, some 20 minutes
+charts: setup ## speed against accuracy on four scenes (docs/charts), serially, an hour
 	$(call CHART,bar) --meshes cells=100,200,400,800 --steps 5 --budget 3
 	$(call CHART,phason) --meshes cells=20,40,80 --steps 5 --budget 3
-	$(call CHART,notch) $(NOTCH) $(PEERS)
-	$(call CHART,notch) $(NOTCH) --steps 5 --budget 4
-	$(call CHART,plate) $(PLATE) $(PEERS)
-	$(call CHART,plate) $(PLATE) --steps 4 --budget 6
+	$(call CHART,notch) $(NOTCH) $(PEERS) 60
+	$(call CHART,notch) $(NOTCH) --steps 5 --budget 10
+	$(call CHART,plate) $(PLATE) $(PEERS) 100
+	$(call CHART,plate) $(PLATE) --steps 4 --budget 15
 
 # One half of the serial tests; the other takes what is left, in about the same time.
 HALF := $(wildcard tests/test_*.py tests/verification/test_windows*.py) tests/forms tests/kernels \
@@ -76,6 +76,12 @@ verify: setup ## every test, slow ones too: serially, on 2 and on 3 ranks
 
 test-debian13: ## make test in a Debian 13 root (as root; ARGS="..." runs that instead)
 	@tools/test-debian13.sh $(if $(ARGS),"$(ARGS)")
+
+docs: setup ## the documentation as HTML (build/docs), links and docstrings checked
+	@test -x .venv/bin/sphinx-build || \
+	    $(PYTHON) -m pip install -q -c .venv/constraints.txt -e '.[docs]'
+	.venv/bin/sphinx-build -W --keep-going -q -b html docs build/docs
+	@echo build/docs/index.html
 
 lint: setup ## ruff and mypy
 	@test -x .venv/bin/mypy -a -x .venv/bin/ruff || \

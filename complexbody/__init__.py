@@ -8,6 +8,7 @@ dissipation: variational integrators and convergence* ("the paper" in docstrings
 """
 
 from complexbody.body import Body
+from complexbody.dispersion_picture import plot_dispersion
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
@@ -20,6 +21,7 @@ from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
+from complexbody.show import Look, show
 from complexbody.simulate import simulate
 from complexbody.stability import stability
 from complexbody.workprecision import Chart, chart
@@ -37,6 +39,7 @@ __all__ = [
     "Implicit",
     "Initial",
     "LocalLeapfrog",
+    "Look",
     "Newmark",
     "Output",
     "PetscTS",
@@ -49,9 +52,11 @@ __all__ = [
     "chart",
     "constant",
     "plan",
+    "plot_dispersion",
     "ramp",
     "realised_speed_up",
     "ricker",
+    "show",
     "simulate",
     "sine",
     "stability",

@@ -67,6 +67,13 @@ def equispaced(domain: mesh.Mesh) -> None:
         )
 
 
+def space() -> Any:
+    """A UFL domain for symbols that belong to no mesh: affine tetrahedra in space."""
+    if hasattr(ufl, "VectorElement"):
+        return ufl.Mesh(ufl.VectorElement("Lagrange", ufl.tetrahedron, 1))
+    return ufl.Mesh(import_module("basix.ufl").element("Lagrange", "tetrahedron", 1, shape=(3,)))
+
+
 def vector_space(domain: mesh.Mesh, components: int) -> fem.FunctionSpace:
     """Blocked continuous P1 space with values of shape (components,)."""
     if hasattr(fem, "VectorFunctionSpace") and not hasattr(fem, "functionspace"):

@@ -150,6 +150,72 @@ class Body:
         """η as a (k, k) matrix."""
         return self._square("viscosity", self.viscosity)
 
+    def dispersion(
+        self,
+        q: Any,
+        *,
+        polarisations: bool = False,
+        u: Any = 0.0,
+        U: Any = 0.0,
+        nu: Any = 0.0,
+        N: Any = 0.0,
+    ) -> Any:
+        r"""Frequencies of the plane waves a exp i(q·x − ωt) of the body in space, in any direction.
+
+        .. math:: (K(q) - i\omega D - \omega^2 M)\,a = 0,
+
+        with K(q) from the Hessian of ρe and ρw, M = diag(ρ, …, Ω), D = diag(0, …, η). Re ω is the
+        angular frequency, −Im ω the rate of decay (of growth if negative: the state is unstable).
+        Where ``inertia`` is a χ(ν, ν̇), its second derivatives at ν̇ = 0 take its place, with the
+        gyroscopic force that may come of them.
+
+        A body with a quadratic e, w and χ has the same waves at any state. Any other one is
+        linearised at the uniform state (u, U, ν, N), which must be at rest: e + w is stationary in
+        u and ν. Where ν and N ≠ 0 both enter the Hessian, that is a local statement.
+
+        Args:
+            q: Wave vector [1/m]: a number (along x), or the last axis of an array, of 1 to 3
+                components.
+            polarisations: Whether to return a as well.
+            u: Displacement of the state [m], a number or shape (n_u,).
+            U: Its gradient, a number or shape (n_u, 3).
+            nu: ν of the state, a number or shape (k,).
+            N: Its gradient, a number or shape (k, 3).
+
+        Returns:
+            ω [rad/s], shape (…, b) for q of shape (…, m), b = 2(n_u + k) less one for each
+            direction of ν without inertia, by real part. With ``polarisations`` also a, shape
+            (…, n_u + k, b): |a| = 1 in the fields' own units, the largest component positive.
+
+        Raises:
+            BodyError: for a q or a state that makes no sense, coefficients that vary in space, a
+                density without second derivatives at the state, a state that is not at rest, or a
+                component with neither inertia nor viscosity.
+        """
+        from complexbody import dispersion  # it stands above, and reads the energy
+
+        state = {"u": u, "U": U, "nu": nu, "N": N}
+        return dispersion.of_body(self, q, state, polarisations)
+
+    def scales(self, cell: float, size: float, dim: int = 3) -> Any:
+        """Times of the fields on cells and bodies of a given size; ``print`` makes a table of them.
+
+        Of u and ν, each alone: the time a wave takes across a cell and across the body, √(ρL²/H),
+        or, where that is longer, diffusion, ηL²/H; periods 2π√(Ω/H_νν) or relaxation η/H_νν; and
+        Ω/η, in which viscosity stops inertia (:func:`complexbody.waves.scales`).
+
+        Args:
+            cell: Size of a cell [m].
+            size: Of the body [m].
+            dim: Dimension of the mesh, along whose axes waves run.
+
+        Raises:
+            BodyError: as :meth:`dispersion` at the state zero, or for sizes that are not positive.
+        """
+        from complexbody import dispersion
+
+        return dispersion.scales_of(self, cell, size, dim)
+
     def _square(self, name: str, value: Any) -> Matrix:
         k = int(self.descriptor)
         # Texts, truth values and complex numbers would be converted without a word.

@@ -9,6 +9,7 @@ examples:
   complexbody run demos/impact.py --set cells=80 --until 2e-5 --out results/fine
   mpirun -n 4 complexbody run demos/impact.py     the same on four processes
   complexbody chart demos/graded_crack.py         which method is the cheapest for which error?
+  complexbody show results/impact                 pictures of its fields, energies and probes
   complexbody info                                versions, compiler, what is missing
 
 a scene file is a Python file with

@@ -44,6 +44,10 @@ class OutputError(ComplexBodyError, OSError):
     """Results cannot be written where the user asked."""
 
 
+class ResultsError(ComplexBodyError, ValueError):
+    """A folder does not have the results that are asked for, or they cannot be read."""
+
+
 class CommandError(ComplexBodyError):
     """The command line or a scene file is wrong."""
 

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import ufl
 from dolfinx import fem
 from ufl import classes as uc
@@ -22,6 +23,7 @@ from ufl.algorithms.apply_derivatives import apply_derivatives
 
 from complexbody import _compat
 
+Array = npt.NDArray[np.float64]
 #: Monomial (sorted indices of unknowns, at most two) -> coefficient (float or UFL scalar).
 Poly = dict[tuple[int, ...], Any]
 
@@ -60,12 +62,14 @@ def read(density: Callable[..., Any], mesh: Any, n_u: int, k: int, values: str) 
 
     Args:
         density: ``e(U, nu, N)`` if ``values`` is "gradients", ``w(u, nu)`` if it is "fields".
-        mesh: The dolfinx mesh, whose dimension says which columns of U and N exist.
+        mesh: The dolfinx mesh, whose dimension says which columns of U and N exist; None for
+            space, where all do.
         n_u: Components of u.
         k: Components of ν.
         values: Which of the two it is.
     """
-    n, dim, domain = n_u + k, mesh.geometry.dim, mesh.ufl_domain()
+    n, dim = n_u + k, 3 if mesh is None else mesh.geometry.dim
+    domain = _compat.space() if mesh is None else mesh.ufl_domain()
     # A reduced scene may have no component of one of them.
     u, nu = (ufl.Constant(domain, shape=(m,)) if m else None for m in (n_u, k))
     U, N = (ufl.Constant(domain, shape=(m, 3)) if m else None for m in (n_u, k))
@@ -81,10 +85,58 @@ def read(density: Callable[..., Any], mesh: Any, n_u: int, k: int, values: str) 
     expression = density(U, nu, N) if values == "gradients" else density(u, nu)
     reader = _Reader(unknown)
     try:
-        lowered = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(expression)))
-        poly = reader.visit(lowered, (), {})
+        return _read(reader, expression)
     except NotQuadratic:
         return None
+
+
+def read_at(
+    density: Callable[..., Any], n_u: int, k: int, values: str, state: Sequence[Array]
+) -> Quadratic:
+    """The Taylor polynomial of degree two of any density at a state, in space.
+
+    Args:
+        density: As for :func:`read`.
+        n_u: Components of u.
+        k: Components of ν.
+        values: As for :func:`read`.
+        state: Numbers in place of the arguments of ``density``.
+
+    Raises:
+        NotQuadratic: if it has no second derivative there that can be read.
+    """
+    n, domain = n_u + k, _compat.space()
+    shapes = [np.shape(value) for value in state]
+    at, change = ([ufl.Constant(domain, shape=shape) for shape in shapes] for _ in range(2))
+    own = 3 * n + n_u  # where ν stands; before it u, before that N and U
+    first = (0, own, 3 * n_u) if values == "gradients" else (3 * n, own)
+
+    def unknown(terminal: Any, component: tuple[int, ...]) -> Poly | None:
+        for x, value in zip(at, state, strict=True):
+            if terminal is x:
+                return _constant(float(value[component]))
+        for x, start, shape in zip(change, first, shapes, strict=True):
+            if terminal is x:
+                return {(start + int(np.ravel_multi_index(component, shape)),): 1.0}
+        return None
+
+    variables = [ufl.variable(x) for x in at]
+
+    def varied(e: Any) -> Any:
+        pairs = zip(variables, change, strict=True)
+        return sum(ufl.inner(ufl.diff(e, x), y) for x, y in pairs)
+
+    expression = ufl.as_ufl(density(*variables))
+    slope = varied(expression)
+    try:
+        return _read(_Reader(unknown), expression + slope + 0.5 * varied(slope))
+    except (ZeroDivisionError, ValueError, OverflowError):
+        raise NotQuadratic from None  # a function at the edge of where it is defined
+
+
+def _read(reader: _Reader, expression: Any) -> Quadratic:
+    lowered = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(expression)))
+    poly = reader.visit(lowered, (), {})
     hessian: dict[tuple[int, int], Any] = {}
     for monomial, value in poly.items():
         if len(monomial) == 2:
@@ -197,6 +249,8 @@ class _Reader:
             raise NotQuadratic
         operands = [ufl.as_ufl(a.get((), 0.0)) for a in arguments]
         value = e._ufl_expr_reconstruct_(*operands)
+        if isinstance(value, uc.Zero):  # which is no ScalarValue
+            return {}
         return _constant(float(value)) if isinstance(value, uc.ScalarValue) else {(): value}
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody import guards
-from complexbody.errors import DivergenceError
+from complexbody.errors import DivergenceError, ResultsError
 from complexbody.integrators.entries import Entries, Run
 from complexbody.problem import Problem
 
@@ -50,6 +50,8 @@ class Ledger:
         self.rows: list[list[float]] = []
 
     def __getitem__(self, name: str) -> Array:
+        if name not in self.columns:
+            raise ResultsError(f"The ledger has no {name!r}. It has {', '.join(self.columns)}.")
         index = self.columns.index(name)
         return np.array([row[index] for row in self.rows])
 

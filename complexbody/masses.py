@@ -249,9 +249,8 @@ class Masses:
             alpha[c][ix] = inverse @ minus[c][ix]
             # Rates at a step's own time: M q̇ = M̂v − (hD/2)v + (h/2) f; without inertia D q̇ = f.
             m, d = M[c][ix], D[c][ix]
-            if np.linalg.matrix_rank(m, tol=1e-13 * max(np.abs(m).max(initial=0), 1e-300)) == len(
-                free
-            ):
+            unit = _units(m, d)
+            if np.linalg.matrix_rank(m * np.outer(unit, unit), tol=1e-13) == len(free):
                 back = np.linalg.inv(m) if free.size else m
                 to_rate[c][ix], force_to_rate[c][ix] = back @ minus[c][ix], 0.5 * h * back
             else:
@@ -272,9 +271,17 @@ class Masses:
         return out
 
 
+def _units(m: Array, d: Array) -> Array:
+    """Units of the components in which diagonals are one: ρ and ρ̄ may be 15 decades apart."""
+    weight = np.where(np.diag(m) > 0, np.diag(m), np.diag(d))
+    return 1 / np.sqrt(np.where(weight > 0, weight, 1.0))
+
+
 def _first_order(m: Array, d: Array, minus: Array, h: float) -> tuple[Array, Array, Array]:
     """Rates where some components have no inertia: those obey D q̇ = f, the others momentum."""
-    V, mm, dd = pencil_basis(m, d)
+    unit = _units(m, d)
+    V, mm, dd = pencil_basis(m * np.outer(unit, unit), d * np.outer(unit, unit))
+    V = unit[:, None] * V
     inertial = mm > 0
     inverse_m = np.where(inertial, 1.0 / np.where(inertial, mm, 1.0), 0.0)
     inverse_d = np.where(inertial, 0.0, 1.0 / np.where(dd > 0, dd, 1.0))

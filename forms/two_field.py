@@ -25,6 +25,7 @@ Coercive on (sym U, ν, N) iff
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import ufl
@@ -32,6 +33,8 @@ import ufl
 from complexbody.body import Body
 from complexbody.errors import BodyError
 from complexbody.forms._admissible import Energy, finite, require, require_positive
+
+NAMES = ("lam", "mu", "k0", "k1", "k2", "k2_skew", "k3", "k3_sym")
 
 
 def _energy(
@@ -64,6 +67,31 @@ def _energy(
         return phonon + descriptor + coupling
 
     return energy
+
+
+def admissible(family: str, d: int, given: Mapping[str, Any]) -> dict[str, float]:
+    """The constants of :func:`isotropic_two_field` as floats.
+
+    Raises:
+        CoercivityError: unless the inequalities above hold.
+        BodyError: for constants that are not finite numbers, or a d other than 1, 2 or 3.
+    """
+    if isinstance(d, bool) or d not in (1, 2, 3):
+        raise BodyError(f"{family}: d is {d!r}, not a dimension. Give d=1, 2 or 3.")
+    constants = finite(family, given)
+    lam, mu, k0, k1, k2, _, k3, k3_sym = (constants[name] for name in NAMES)
+    require(family, "k0 >= 0", k0, 0.0, "Give k0 a value of zero or more.", strict=False)
+    if d > 1:
+        require_positive(family, constants, ("mu", "k2", "k2_skew"))
+        remedy = "Choose a smaller |k3_sym|, or a larger mu or k2."
+        require(family, "4*mu*k2 > k3_sym**2", 4 * mu * k2, k3_sym**2, remedy)
+    pressure, own, shared = lam + 2 * mu / d, k1 + 2 * k2 / d, k3 + k3_sym / d
+    require(family, f"lam + 2*mu/{d} > 0", pressure, 0.0, "Choose a larger lam.")
+    require(family, f"k1 + 2*k2/{d} > 0", own, 0.0, "Choose a larger k1.")
+    inequality = f"(lam + 2*mu/{d})*(k1 + 2*k2/{d}) > (k3 + k3_sym/{d})**2"
+    remedy = f"Bring k3 nearer to {-k3_sym / d:.9g}, or choose a larger lam or k1."
+    require(family, inequality, pressure * own, shared**2, remedy)
+    return constants
 
 
 def isotropic_two_field(
@@ -105,21 +133,8 @@ def isotropic_two_field(
             body can have.
     """
     family = "isotropic_two_field"
-    if isinstance(d, bool) or d not in (1, 2, 3):
-        raise BodyError(f"{family}: d is {d!r}, not a dimension. Give d=1, 2 or 3.")
     descriptor = {"k0": k0, "k1": k1, "k2": k2, "k2_skew": k2_skew, "k3": k3, "k3_sym": k3_sym}
-    constants = finite(family, {"lam": lam, "mu": mu, **descriptor})
-    require(family, "k0 >= 0", k0, 0.0, "Give k0 a value of zero or more.", strict=False)
-    if d > 1:
-        require_positive(family, constants, ("mu", "k2", "k2_skew"))
-        remedy = "Choose a smaller |k3_sym|, or a larger mu or k2."
-        require(family, "4*mu*k2 > k3_sym**2", 4 * mu * k2, k3_sym**2, remedy)
-    pressure, own, shared = lam + 2 * mu / d, k1 + 2 * k2 / d, k3 + k3_sym / d
-    require(family, f"lam + 2*mu/{d} > 0", pressure, 0.0, "Choose a larger lam.")
-    require(family, f"k1 + 2*k2/{d} > 0", own, 0.0, "Choose a larger k1.")
-    inequality = f"(lam + 2*mu/{d})*(k1 + 2*k2/{d}) > (k3 + k3_sym/{d})**2"
-    remedy = f"Bring k3 nearer to {-k3_sym / d:.9g}, or choose a larger lam or k1."
-    require(family, inequality, pressure * own, shared**2, remedy)
+    constants = admissible(family, d, {"lam": lam, "mu": mu, **descriptor})
     energy = _energy(d, **constants)
     return Body(
         d, energy, density, inertia, viscosity, displacement=d, name=name, constants=constants

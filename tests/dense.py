@@ -93,7 +93,10 @@ def random_hessian(seed, n_u, k, dim):
 
 
 def hessian_of(body, dim):
-    """H of a body's quadratic density by polarisation, in the order of :func:`unknowns`."""
+    """H of a body's quadratic density by polarisation, in the order of :func:`unknowns`.
+
+    A potential counts with its ν alone.
+    """
     n_u, k = body.displacement, body.descriptor
     n = n_u + k
 
@@ -101,7 +104,11 @@ def hessian_of(body, dim):
         gradient = np.zeros((n, 3))
         gradient[:, :dim] = g[: n * dim].reshape(n, dim)
         parts = gradient[:n_u], g[n * dim :], gradient[n_u:]
-        return float(body.energy(*(ufl.as_tensor(part.tolist()) for part in parts)))
+        outer = 0.0
+        if body.potential is not None:
+            still = ufl.as_tensor(np.zeros(n_u).tolist())
+            outer = float(body.potential(still, ufl.as_tensor(parts[1].tolist())))
+        return outer + float(body.energy(*(ufl.as_tensor(part.tolist()) for part in parts)))
 
     unit = np.eye(n * dim + k)
     H = np.diag([2 * value(e) for e in unit])
@@ -267,7 +274,7 @@ class Plain:
 
     def rate(self, f):
         """q̇ at the step's own time: half the kick is done ("trapezoidal"), or nothing of it."""
-        out = np.zeros(len(self.M))
+        out = np.zeros(len(self.M), np.asarray(f).dtype)
         half = 0.5 * self.h * self.inverse @ f[self.heavy] * (self.start == "trapezoidal")
         lost = 0.5 * self.h * self.inverse @ self.d @ self.v if self.scheme == "symmetric" else 0.0
         out[self.heavy] = self.v - lost + half

@@ -198,7 +198,7 @@ def _fail(x):
     "fix, words",
     [
         (lambda c: cb.Fix("u", lambda x: x[0] < -5.0), ("Fix('u'", "selects no node")),
-        (lambda c: cb.Fix("nu", lambda x: 1 * (x[0] < 0.5)), ()),  # 0 and 1 are fine
+        (lambda c: cb.Fix("nu", lambda x: 1 * (x[0] > -9.0)), ()),  # 0 and 1 are fine
         (
             lambda c: cb.Fix("nu", _on_last_rank(c, lambda x: x[0])),
             ("Fix('nu')", "float64, no truth values"),

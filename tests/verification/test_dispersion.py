@@ -7,41 +7,18 @@ scheme itself (K_h is Hermitian and K_h(−q) its conjugate). Here it is prescri
 and started inside, where it must then go on.
 """
 
-import itertools
-
 import numpy as np
 import pytest
 import scipy.linalg
-from dense import element_matrices, hessian_of, prepared, state, whole
+from dense import prepared, state, whole
+from verification.lattice import lattice_mesh, lattice_stiffness
 
 import complexbody as cb
-from complexbody import meshes
 from complexbody.forms import (
     hexagonal_quasicrystal,
     isotropic_two_field,
     scaled_icosahedral_quasicrystal,
 )
-
-
-def kuhn(size):
-    """Corners of the d! simplices of one cell of the lattice, shape (d!, d+1, d)."""
-    d = len(size)
-    paths = [
-        np.cumsum([np.zeros(d), *np.eye(d)[list(order)]], axis=0)
-        for order in itertools.permutations(range(d))
-    ]
-    return np.array(paths) * size
-
-
-def lattice_stiffness(body, size, q, lumped):
-    """K_h(q) per node, shape (n, n): the sum over one lattice cell of K_ab e^{iq·(x_b − x_a)}."""
-    dim, n = len(size), body.components
-    corners = kuhn(size)
-    local = element_matrices(corners, hessian_of(body, dim), n, body.descriptor, lumped)
-    m = dim + 1
-    local = local.reshape(len(corners), m, n, m, n)
-    phase = np.exp(1j * (corners[:, None, :, :] - corners[:, :, None, :]) @ q)
-    return np.einsum("caibj,cab->ij", local, phase)
 
 
 def chiral(dim):
@@ -78,10 +55,7 @@ CASES = {
 def test_plane_wave(comm, case, self_action, branch):
     cells, body = CASES[case]
     dim, sides = len(cells), np.array([1.0, 0.8, 0.7])[: len(cells)]
-    if dim == 1:
-        mesh = meshes.interval(comm, 0, sides[0], cells[0])
-    else:
-        mesh = (meshes.rectangle, meshes.box)[dim - 2](comm, [0] * dim, sides, cells)
+    mesh = lattice_mesh(comm, sides, cells)
     size, q = sides / cells, np.array([4.1, -5.3, 3.2])[:dim]
     n_u, n = body.displacement, body.components
     stiff = lattice_stiffness(body, size, q, self_action == "lumped")
