@@ -15,10 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody.errors import BodyError
+from complexbody.given import is_finite, is_number, is_whole, numbers, short
 from complexbody.rotations import RotationAction
 
 Number = float | int
 Matrix = npt.NDArray[np.float64]
+
+#: More components, or points of quadrature, are a mistake: kernels would take for ever to compile.
+MOST_COMPONENTS, MOST_DEGREE = 1000, 40
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,8 @@ class Body:
             momentum, and ``cb.objectivity`` checks the energy.
         parity: How ν goes under a mirror, if a :class:`complexbody.Symmetry` is to know: "polar",
             "axial", "even", "odd", "tensor", or None.
+        orientation: Stop a run in which a cell turns inside out, det(I + ∇u) ≤ 0; asked only of
+            energies that are not quadratic in U. False for those that mean something there.
 
     Raises:
         BodyError: for shapes, signs or values that no body can have.
@@ -70,13 +76,14 @@ class Body:
     constants: Mapping[str, float] = field(default_factory=dict)
     rotation: RotationAction | None = None
     parity: str | None = None
+    orientation: bool = True
 
     def __post_init__(self) -> None:
         for name in ("descriptor", "displacement"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            if not (is_whole(value) and 1 <= value <= MOST_COMPONENTS):
                 raise BodyError(
-                    f"Body: {name} is {value!r}, not a whole number of components. "
+                    f"Body: {name} is {short(value)}, not a whole number of components. "
                     f"Give {name}=1 or more."
                 )
         if not callable(self.energy):
@@ -94,15 +101,17 @@ class Body:
                 f"Body: rotation {self.rotation.name!r} acts on {self.rotation.components} "
                 f"components, but the descriptor has {self.descriptor}. Give one that fits."
             )
-        if not (_is_number(self.density) or hasattr(self.density, "function_space")):
+        if not (is_number(self.density) or hasattr(self.density, "function_space")):
             raise BodyError(
-                f"Body: density is {self.density!r}, neither a number nor a DG0 Function. Give "
-                "ρ > 0 in kg/m³."
+                f"Body: density is {short(self.density)}, neither a number nor a DG0 Function. "
+                "Give ρ > 0 in kg/m³."
             )
-        if _is_number(self.density) and not (np.isfinite(self.density) and self.density > 0):
+        if is_number(self.density) and not (is_finite(self.density) and self.density > 0):
             raise BodyError(
-                f"Body: density is {self.density}, but mass must be positive. Give ρ > 0 in kg/m³."
+                f"Body: density is {short(self.density)}, but mass must be positive. Give ρ > 0 in "
+                "kg/m³."
             )
+        self._check_manners()
         if not callable(self.inertia):
             _check_psd("inertia", self.inertia_matrix, self.inertia)
         _check_psd("viscosity", self.viscosity_matrix, self.viscosity)
@@ -113,6 +122,21 @@ class Body:
                     "Body: a component of the descriptor has neither inertia nor viscosity, so "
                     "nothing determines its rate. Give inertia > 0 or viscosity > 0 for it."
                 )
+
+    def _check_manners(self) -> None:
+        """What no equation sees."""
+        degree = self.quadrature_degree
+        if degree is not None and not (is_whole(degree) and 0 <= degree <= MOST_DEGREE):
+            raise BodyError(
+                f"Body: quadrature_degree is {short(degree)}. Give None or a whole number from 0 "
+                f"to {MOST_DEGREE}."
+            )
+        for name, kind, what in (
+            ("name", str, "a text"), ("constants", Mapping, "a dict"),
+            ("orientation", bool, "True or False"),
+        ):  # fmt: skip
+            if not isinstance(getattr(self, name), kind):
+                raise BodyError(f"Body: {name} is {short(getattr(self, name))}. Give {what}.")
 
     @property
     def components(self) -> int:
@@ -206,12 +230,12 @@ class Body:
 
     def _square(self, name: str, value: Any) -> Matrix:
         k = int(self.descriptor)
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        # Texts, truth values and complex numbers would be converted without a word.
+        array = numbers(value)
+        if array is None:
             raise BodyError(
-                f"Body: {name} is {value!r}. Give a number or a {k}×{k} matrix of numbers."
-            ) from None
+                f"Body: {name} is {short(value)}. Give a number or a {k}×{k} matrix of numbers."
+            )
         if array.ndim == 0:
             return np.diag(np.full(k, float(array)))
         if array.shape != (k, k):
@@ -222,25 +246,25 @@ class Body:
         return array
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating)
-
-
 def _scaled(matrix: Matrix) -> Matrix:
-    """The matrix with unit diagonal where the diagonal is positive, so that units do not matter."""
-    d = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    """The matrix with ±1 or 0 on its diagonal, so that units do not matter."""
+    d = np.sqrt(np.abs(np.diag(matrix)))
     d = np.where(d > 0, d, 1.0)
-    return matrix / np.outer(d, d)
+    return matrix / d / d[:, None]
 
 
 def _check_psd(name: str, matrix: Matrix, given: Any) -> None:
     if not np.all(np.isfinite(matrix)):
-        raise BodyError(f"Body: {name} is {given!r}, which is not finite. Give finite numbers.")
+        raise BodyError(
+            f"Body: {name} is {short(given)}, which is not finite. Give finite numbers."
+        )
     scale = np.abs(matrix).max(initial=0.0)
     if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-12 * scale:
         raise BodyError(
             f"Body: the {name} matrix is not symmetric. Give its symmetric part: the rest "
             "contributes neither to the kinetic energy nor to the dissipation."
         )
-    if np.linalg.eigvalsh(_scaled(0.5 * (matrix + matrix.T))).min(initial=0.0) < -1e-12:
-        raise BodyError(f"Body: {name} is negative ({given!r}). Give {name} ≥ 0.")
+    part = 0.5 * matrix + 0.5 * matrix.T
+    alone = np.diag(part) == 0  # a row of a semidefinite matrix whose diagonal is zero is zero
+    if np.any(part[alone]) or np.linalg.eigvalsh(_scaled(part)).min(initial=0.0) < -1e-12:
+        raise BodyError(f"Body: {name} is negative ({short(given)}). Give {name} ≥ 0.")

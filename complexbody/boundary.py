@@ -19,6 +19,7 @@ from complexbody import _compat
 from complexbody.action import Action
 from complexbody.conditions import PointSource, Symmetry
 from complexbody.errors import SceneError, agree
+from complexbody.given import numbers
 from complexbody.histories import Constant, History
 from complexbody.mirrors import fixed_components, mirror_plane
 from complexbody.points import point_load
@@ -29,8 +30,62 @@ Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[Any]  # int32 from dolfinx, int64 from numpy
 
 
+class Amplitudes:
+    """Factors of a user's histories, any of which may fail at any time.
+
+    A rank that raised alone in mid-run would leave the others waiting: here it goes on with NaN,
+    which the next ledger row finds on all ranks.
+
+    Attributes:
+        failure: What the first failure on this rank was.
+    """
+
+    failure: SceneError | None = None
+
+    def factors(self, history: History, times: Array) -> Array:
+        """Factors at the times [s], shape (times,); NaN where they cannot be had."""
+        try:
+            out = numbers(history(times))
+            if out is None:
+                self._failed("returned no real numbers")
+            elif out.shape in ((), times.shape):
+                if not np.all(np.isfinite(out)):
+                    worst = times[np.flatnonzero(~np.isfinite(np.broadcast_to(out, times.shape)))]
+                    self._failed(f"is not finite at t = {worst[0]:.6g} s")
+                return out
+            else:
+                self._failed(f"returned shape {out.shape} for times of shape {times.shape}")
+        except Exception as found:  # a user's callable may fail in any way
+            self._failed(f"cannot be evaluated: {type(found).__name__}: {found}")
+        return np.full(times.shape, np.nan)
+
+    def _failed(self, what: str) -> None:
+        if self.failure is None:
+            self.failure = SceneError(
+                f"The history of a load or support {what}. Give a function of an array of times "
+                "[s] that returns finite factors of the same shape."
+            )
+
+
+#: Times at which histories are tried before a run.
+TRIED = 257
+
+
+def try_histories(comm: Any, histories: list[History], until: float) -> None:
+    """Evaluate histories at many times of a run, before it; collective.
+
+    Raises:
+        SceneError: if one fails, misfits or is not finite, on any rank (on all ranks).
+    """
+    amplitudes = Amplitudes()
+    for history in histories:
+        for times in (np.linspace(0.0, until, TRIED), np.zeros(1)):
+            amplitudes.factors(history, times)
+    agree(comm, amplitudes.failure)
+
+
 @dataclass
-class Supports:
+class Supports(Amplitudes):
     """Prescribed components of this rank's geometry nodes.
 
     Attributes:
@@ -54,7 +109,8 @@ class Supports:
 
     def targets(self, rows: Any, columns: Any, t: float) -> Array:
         """Prescribed values of entries (rows, columns) at time t [s]."""
-        factors = np.array([float(h(t)) for h in self.histories])
+        at = np.array([t], dtype=np.float64)
+        factors = np.concatenate([np.atleast_1d(self.factors(h, at)) for h in self.histories])
         return self.value[rows, columns] * factors[self.history[rows, columns]]
 
 
@@ -130,6 +186,7 @@ def supports(scene: Scene, action: Action) -> Supports:
     agree(comm, error)
     if scene.identified is not None:
         scene.identified.join_supports(out)
+    try_histories(comm, out.histories, 0.0)
     return out
 
 
@@ -196,19 +253,23 @@ def _values(value: Any, points: Array, count: int) -> Array | None:
     """Values (points, count) of a number, a sequence or a callable of x; None if they misfit."""
     if not len(points):
         return np.zeros((0, count))  # ranks without points have nothing to ask
+    found = value(points.T) if callable(value) else value
+    mask = callable(value) and np.asarray(found).dtype == np.bool_  # a predicate means 0 and 1
+    given = numbers(np.asarray(found, dtype=np.int64) if mask else found)
+    if given is None:
+        return None
     try:
         if callable(value):
-            given = np.asarray(value(points.T), dtype=np.float64)
             given = np.broadcast_to(np.atleast_2d(given), (count, len(points))).T
         else:
-            given = np.broadcast_to(np.asarray(value, dtype=np.float64), (len(points), count))
-    except (TypeError, ValueError):
+            given = np.broadcast_to(given, (len(points), count))
+    except ValueError:
         return None
     return given if np.all(np.isfinite(given)) else None
 
 
 @dataclass
-class Loads:
+class Loads(Amplitudes):
     """Partial load vectors of this rank: entry i adds ``factor[group[i]]·value[i]`` at its node.
 
     Attributes:
@@ -229,7 +290,7 @@ class Loads:
         """Factors at the times [s], shape (times, groups)."""
         out = np.ones((len(times), max(len(self.histories), 1)))
         for i, history in enumerate(self.histories):
-            out[:, i] = np.asarray(history(times), dtype=np.float64)
+            out[:, i] = self.factors(history, times)
         return out
 
 
@@ -253,6 +314,7 @@ def loads(scene: Scene, action: Action) -> Loads:
     if not rows:
         empty = np.zeros(0, np.int64)
         return Loads(empty, empty, empty.astype(np.int32), np.zeros(0), [])
+    try_histories(scene.mesh.comm, histories, 0.0)
     node, component, group, value = (np.concatenate(c) for c in zip(*rows, strict=True))
     return Loads(node.astype(np.int64), component.astype(np.int64), group, value, histories)
 

@@ -167,7 +167,9 @@ def _integrator(to: argparse.ArgumentParser) -> None:
         help="implicit: a Newton at each node (default), or SNES with χ integrated in full",
     )  # fmt: skip
     group.add_argument(
-        "--tolerance", metavar="EPS", type=float,
+        "--tolerance",
+        metavar="EPS",
+        type=float,
         help="implicit, newmark, petsc-ts: of the residual; default 1e-12, 1e-10, 1e-10",
     )
     group.add_argument(
@@ -255,6 +257,33 @@ def _as_options(message: str) -> str:
     return message
 
 
+def _parsed(words: list[str]) -> argparse.Namespace | None:
+    """The arguments; None where all that was asked for was --help or --version."""
+    try:
+        arguments = parser().parse_args(words)
+    except SystemExit:
+        return None
+    arguments.words = words
+    return arguments
+
+
+def _obeyed(arguments: argparse.Namespace, ranks: Any) -> None:
+    """Do what the arguments say; collective.
+
+    Raises:
+        CommandError: where a function of the scene file wants the process to end.
+    """
+    try:
+        arguments.function(arguments, ranks)
+    except (Exception, KeyboardInterrupt, Interrupted):
+        raise
+    except BaseException as end:  # sys.exit(), say, which would pass for success
+        raise CommandError(
+            f"A function of the scene file raised {type(end).__name__}({end}). Let it return, or "
+            "raise an Exception."
+        ) from end
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; collective.
 
@@ -273,11 +302,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     code, debug = 0, "--debug" in words
     try:
         with signals(ranks), _warnings(comm), together(ranks):
-            arguments = parser().parse_args(words)
-            arguments.words = words
-            arguments.function(arguments, ranks)
-    except SystemExit as end:  # --help and --version
-        code = int(end.code or 0)
+            arguments = _parsed(words)
+            if arguments is not None:
+                _obeyed(arguments, ranks)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except Elsewhere:  # shown by the rank that met it
@@ -287,6 +314,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             traceback.print_exception(error)
         say(comm, f"complexbody: error: {_as_options(str(error))}", stream=sys.stderr)
         code = error.exit_code
+    except KeyboardInterrupt:  # raised by a user's function: Ctrl-C is Interrupted
+        say(comm, "complexbody: stopped by a KeyboardInterrupt", stream=sys.stderr)
+        code = 128 + signal.SIGINT
     except Interrupted as stop:
         say(comm, f"complexbody: {stop}", stream=sys.stderr)
         code = stop.exit_code

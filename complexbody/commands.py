@@ -26,6 +26,7 @@ from complexbody import machine, precheck, report
 from complexbody.accuracy import Accurate
 from complexbody.errors import CommandError, MissingPackage
 from complexbody.files import on_first_rank
+from complexbody.given import is_positive, is_whole, short
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
@@ -123,9 +124,11 @@ def _settings(a: argparse.Namespace, file: SceneFile) -> dict[str, Any]:
     if isinstance(settings.get("fields"), str):
         listed = [name.strip() for name in settings["fields"].split(",") if name.strip()]
         settings["fields"] = () if listed == ["none"] else tuple(listed)
-    rows = settings.get("ledger_steps", 1)
-    if not isinstance(rows, int) or rows < 1:
-        raise CommandError(f"ledger_steps is {rows!r}. Give a whole number from 1.")
+    rows, until = settings.get("ledger_steps", 1), settings.get("until", 1.0)
+    if not (is_whole(rows) and rows >= 1):
+        raise CommandError(f"ledger_steps is {short(rows)}. Give a whole number from 1.")
+    if not is_positive(until):
+        raise CommandError(f"until is {short(until)}. Give the end of the run in seconds, > 0.")
     if given.get("petsc"):
         given_options = assignments(given["petsc"])
         settings["options"] = {name: str(value) for name, value in given_options.items()}
@@ -152,8 +155,8 @@ def _method(settings: Mapping[str, Any]) -> tuple[str, Any]:
         IntegratorError: for values it does not take.
     """
     name = settings.get("integrator", next(iter(INTEGRATORS)))
-    if name not in INTEGRATORS:
-        raise CommandError(f"No integrator {name!r}. Give one of {', '.join(INTEGRATORS)}.")
+    if not isinstance(name, str) or name not in INTEGRATORS:
+        raise CommandError(f"No integrator {short(name)}. Give one of {', '.join(INTEGRATORS)}.")
     kind = INTEGRATORS[name]
     options = {option: settings[option] for option in _OPTIONS if option in settings}
     known = {field.name for field in fields(kind)}
@@ -276,7 +279,8 @@ def _recorded(
     try:
         yield done
     except BaseException as error:
-        state = f"failed: {error}" if isinstance(error, Exception) else str(error)
+        told = error if isinstance(error, Exception) else f"{type(error).__name__}: {error}"
+        state = str(error) if isinstance(error, Interrupted) else f"failed: {told}"
         if isinstance(error, Interrupted):
             error.args = (f"{error}; what was written until then is in {output.folder}",)
         raise

@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import ufl
+from ufl.algorithms.analysis import extract_arguments
+from ufl.classes import Condition, ScalarValue
+from ufl.corealg.traversal import unique_pre_traversal
 
 from complexbody.errors import BodyError
+from complexbody.given import short
 
 
 def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -32,6 +37,14 @@ def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
             f"The {what} has shape {value.ufl_shape}{free}, but a density is a scalar. Contract "
             "its indices, for instance with ufl.inner."
         )
+    if isinstance(value, Condition) or extract_arguments(value):
+        raise BodyError(
+            f"The {what} is no number: {short(value)}. Return a scalar expression of its "
+            "arguments, for instance with ufl.conditional."
+        )
+    for part in unique_pre_traversal(value):
+        if isinstance(part, ScalarValue) and not _is_finite(part):
+            raise BodyError(f"The {what} has the constant {short(part)}. Give finite real numbers.")
     return value
 
 
@@ -53,3 +66,10 @@ def deformation(U: Any) -> Any:
             for i in range(3)
         ]
     )  # fmt: skip
+
+
+def _is_finite(constant: Any) -> bool:
+    try:
+        return math.isfinite(float(constant))
+    except (TypeError, OverflowError):  # complex, or hundreds of digits
+        return False

@@ -79,9 +79,18 @@ class MissingPackage(ComplexBodyError, ImportError):
 
 
 class DivergenceError(ComplexBodyError, ArithmeticError):
-    """A run produced non-finite values or energy it was not given."""
+    """A run produced non-finite values, energy it was not given, or cells turned inside out.
+
+    Attributes:
+        ledger: The books up to the row that stopped it, where a ledger was kept.
+        last_good: Time of the last row in which all was well [s], None if there was none.
+        place: The node or cell, a :class:`complexbody.guards.Place`, or None if all are alike.
+    """
 
     exit_code = 4
+    ledger: Any = None
+    last_good: float | None = None
+    place: Any = None
 
 
 class SolverError(ComplexBodyError, ArithmeticError):

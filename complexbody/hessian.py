@@ -153,6 +153,32 @@ def _read(reader: Reader, expression: Any) -> Quadratic:
     return Quadratic(poly.get((), 0.0), linear, hessian, reader.cellwise)
 
 
+def quadratic_in_gradient(density: Callable[..., Any], mesh: Any, n_u: int, k: int) -> bool:
+    """Whether ``e(U, nu, N)`` is a polynomial of degree two in U alone, whatever it is in ν and N.
+
+    Args:
+        density: The stored energy density.
+        mesh: The dolfinx mesh, whose dimension says which columns of U exist.
+        n_u: Components of u.
+        k: Components of ν.
+    """
+    domain = mesh.ufl_domain()
+    U, nu, N = (ufl.Constant(domain, shape=s) for s in ((n_u, 3), (k,), (k, 3)))
+
+    def unknown(terminal: Any, component: tuple[int, ...]) -> Poly | None:
+        if terminal is not U:
+            return None
+        i, j = component
+        return {(3 * i + j,): 1.0} if j < mesh.geometry.dim else {}
+
+    try:
+        lowered = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(density(U, nu, N))))
+        Reader(unknown).visit(lowered, (), {})
+    except NotQuadratic:
+        return False
+    return True
+
+
 class Reader:
     """Evaluates lowered UFL over polynomials; ``cellwise`` turns False at a varying coefficient."""
 

@@ -23,6 +23,7 @@ from complexbody.action import Action
 from complexbody.derived import CELL_FIELDS, NODAL_FIELDS, Derived
 from complexbody.errors import OutputError, SceneError
 from complexbody.files import CsvWriter, Series, in_input_order, on_first_rank
+from complexbody.given import is_finite, is_positive, is_whole, numbers, short
 from complexbody.probes import Probes
 
 __all__ = ["CELL_FIELDS", "NODE_FIELDS", "STEP_FIELDS", "CsvWriter", "Output", "Probes", "Writer"]
@@ -64,33 +65,48 @@ class Output:
     picture: bool = False
 
     def __post_init__(self) -> None:
-        fields = (self.fields,) if isinstance(self.fields, str) else tuple(self.fields)
-        object.__setattr__(self, "folder", Path(self.folder))
-        object.__setattr__(self, "fields", tuple(dict.fromkeys(fields)))
-        object.__setattr__(self, "times", tuple(np.atleast_1d(self.times)))
+        if not isinstance(self.folder, str | Path) or "\0" in str(self.folder):
+            raise OutputError(f"Output: folder is {short(self.folder)}. Give a path.")
+        given = (self.fields,) if isinstance(self.fields, str) else self.fields
         known = (*NODE_FIELDS, *CELL_FIELDS, *STEP_FIELDS)
-        for name in self.fields:
-            if name not in (*known, *NODAL_FIELDS):
-                raise OutputError(f"Output: field {name!r} is not known. Give {', '.join(known)}.")
+        if not isinstance(given, Sequence):
+            raise OutputError(f"Output: fields are {short(given)}. Give some of {known}.")
+        for name in given:
+            if not isinstance(name, str) or name not in (*known, *NODAL_FIELDS):
+                raise OutputError(
+                    f"Output: field {short(name)} is not known. Give {', '.join(known)}."
+                )
+        empty = isinstance(self.times, Sequence) and not self.times
+        times = np.zeros(0) if empty else numbers(self.times)
+        if times is None or times.ndim > 1:
+            raise OutputError(f"Output: times are {short(self.times)}. Give numbers in seconds.")
+        object.__setattr__(self, "folder", Path(self.folder))
+        object.__setattr__(self, "fields", tuple(dict.fromkeys(given)))
+        object.__setattr__(self, "times", tuple(np.atleast_1d(times).tolist()))
         if self.every is not None and len(self.times):
             raise OutputError("Output: every and times exclude each other. Give one of them.")
-        if self.every is not None and not (_is_finite(self.every) and self.every > 0):
-            raise OutputError(f"Output: every is {self.every!r}. Give a positive time in seconds.")
-        if not all(_is_finite(time) and time >= 0 for time in self.times):
+        if self.every is not None and not is_positive(self.every):
+            raise OutputError(
+                f"Output: every is {short(self.every)}. Give a positive time in seconds."
+            )
+        if not all(is_finite(time) and time >= 0 for time in self.times):
             raise OutputError("Output: times has a negative or non-finite entry. Give seconds ≥ 0.")
         steps = self.probe_steps
-        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
-            raise OutputError(f"Output: probe_steps is {steps!r}. Give a whole number from 1.")
+        if not (is_whole(steps) and steps > 0):
+            raise OutputError(f"Output: probe_steps is {short(steps)}. Give a whole number from 1.")
         if not isinstance(self.probes, Mapping):
             raise SceneError("Output: probes is not a mapping. Give probes={'name': (x, y, …)}.")
         for name, point in self.probes.items():
-            if not 1 <= np.size(point) <= 3 or not all(_is_finite(x) for x in np.ravel(point)):
+            place = numbers(point)
+            if place is None or not 1 <= place.size <= 3 or not np.all(np.isfinite(place)):
                 raise SceneError(
-                    f"Output: probe {name!r} is at {point!r}. Give one finite coordinate per "
-                    "dimension of the mesh."
+                    f"Output: probe {short(name)} is at {short(point)}. Give one finite "
+                    "coordinate per dimension of the mesh."
                 )
-            if not isinstance(name, str) or Path(name).name != name:
-                raise SceneError(f"Output: probe name {name!r} names no file. Give a plain name.")
+            if not isinstance(name, str) or Path(name).name != name or "\0" in name or not name:
+                raise SceneError(
+                    f"Output: probe name {short(name)} names no file. Give a plain name."
+                )
 
     def schedule(self, until: float) -> Array:
         """Sorted output times from 0 to ``until`` [s], both included.
@@ -98,7 +114,7 @@ class Output:
         Raises:
             OutputError: if ``until`` is not positive, or there would be over a million outputs.
         """
-        if not (_is_finite(until) and until > 0):
+        if not is_positive(until):
             raise OutputError(f"Output: the end is at {until!r} s. Give a positive, finite time.")
         times = np.asarray(self.times, dtype=np.float64)
         if self.every is not None:
@@ -214,7 +230,3 @@ def _padded(name: str, values: Array) -> Array:
     count = values.shape[1]
     full = {6: 9} if "stress" in name else {2: 3}
     return np.pad(values, ((0, 0), (0, full.get(count, count) - count)))
-
-
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and math.isfinite(value)

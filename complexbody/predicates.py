@@ -28,4 +28,9 @@ def mask(what: str, where: Any, x: Any) -> tuple[npt.NDArray[np.bool_], Exceptio
             f"{what}: the predicate returned shape {found.shape} for {x.shape[1]} points. Return "
             "one truth value per column of x."
         )
+    if found.dtype.kind not in "biu":
+        return none, SceneError(
+            f"{what}: the predicate returned values of type {found.dtype}, no truth values. Return "
+            "one truth value per column of x."
+        )
     return found.astype(np.bool_), None

@@ -24,6 +24,7 @@ from complexbody.body import Body
 from complexbody.convexity import Convexity, Range
 from complexbody.dampers import Dampers, dampers
 from complexbody.discretisation import Discretisation
+from complexbody.errors import BodyError, SceneError
 from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
@@ -72,6 +73,7 @@ class Problem:
     def __init__(self, scene: Scene, reduce: bool = False) -> None:
         self.scene, self.whole, self.comm = scene, scene, scene.mesh.comm
         self.action = self.whole_action = Action(scene)
+        self.action.check_densities()
         dofs = _compat.cell_dofs(self.action.space)
         # All layers below rely on one numbering of nodes and P1 degrees of freedom.
         assert np.array_equal(dofs, _compat.cell_nodes(scene.mesh))
@@ -83,8 +85,12 @@ class Problem:
         self.quiet = True
         self.known_steps: dict[str, Array] = {}
         self.arrange()
-        self.warnings = check_energy(self)
-        check_mirrors(self)
+        try:
+            self.warnings = check_energy(self)
+            check_mirrors(self)
+        except (BodyError, SceneError):  # which all ranks have: closing is collective
+            self.close()
+            raise
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
         self.full: Problem = self
         if reduce:

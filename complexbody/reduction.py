@@ -62,7 +62,7 @@ def reduced_body(body: Body, u: Sequence[int], nu: Sequence[int]) -> Body:
         # A general χ keeps all of ν (complexbody.live).
         body.inertia if callable(body.inertia) else body.inertia_matrix[ix],
         body.viscosity_matrix[ix], None if body.potential is None else outer, len(u),
-        body.quadrature_degree, body.name, body.constants,
+        body.quadrature_degree, body.name, body.constants, orientation=body.orientation,
     )  # fmt: skip
 
 

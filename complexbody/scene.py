@@ -17,7 +17,8 @@ import numpy as np
 from complexbody import _compat
 from complexbody.body import Body
 from complexbody.conditions import FIELDS, Absorb, PointSource, Symmetry, Value, Where, known_field
-from complexbody.errors import MeshError, SceneError, agree
+from complexbody.errors import BodyError, MeshError, SceneError, agree
+from complexbody.given import is_whole, short
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
 from complexbody.periodicity import Identified, Periodic, checked, identify
@@ -158,9 +159,12 @@ class Scene:
         self._check_tags()
         if not isinstance(self.initial, Initial):
             raise SceneError("Scene: initial is not an Initial. Give initial=cb.Initial(u=…).")
-        if self.self_action not in ("consistent", "lumped", "implicit"):
+        if not isinstance(self.name, str):
+            raise SceneError(f"Scene: name is {short(self.name)}. Give a text.")
+        known = ("consistent", "lumped", "implicit")
+        if not isinstance(self.self_action, str) or self.self_action not in known:
             raise SceneError(
-                f"Scene: self_action is {self.self_action!r}. Give 'consistent', 'lumped' or "
+                f"Scene: self_action is {short(self.self_action)}. Give 'consistent', 'lumped' or "
                 "'implicit'."
             )
 
@@ -240,6 +244,11 @@ class Scene:
             raise SceneError(
                 "Scene: body is neither a Body nor {cell tag: Body}. Give one of them."
             )
+        if not all(is_whole(tag) for tag in self.body):
+            raise SceneError(
+                f"Scene: a tag of body={{tag: …}} is no whole number: {short(list(self.body))}. "
+                "Give the tags of cell_tags."
+            )
         if not all(isinstance(body, Body) for body in self.body.values()):
             raise SceneError("Scene: a value of body={tag: …} is not a Body. Give Body objects.")
         shapes = {(body.displacement, body.descriptor) for body in self.bodies}
@@ -270,11 +279,19 @@ class Scene:
 
     def _recognise(self) -> None:
         """Give bodies whose χ(ν, ν̇) is ½ν̇·Ων̇ that Ω for their inertia."""
-        if isinstance(self.body, Body):
-            object.__setattr__(self, "body", recognised(self.body, self.mesh))
-        elif any(callable(body.inertia) for body in self.body.values()):
-            known = {tag: recognised(body, self.mesh) for tag, body in self.body.items()}
-            object.__setattr__(self, "body", known)
+        if not any(callable(body.inertia) for body in self.bodies):
+            return
+        known: Any = None
+        error: Exception | None = None
+        try:
+            if isinstance(self.body, Body):
+                known = recognised(self.body, self.mesh)
+            else:
+                known = {tag: recognised(body, self.mesh) for tag, body in self.body.items()}
+        except BodyError as found:
+            error = found
+        agree(self.mesh.comm, error)
+        object.__setattr__(self, "body", known)
 
     def _check_tag_kinds(self) -> None:
         cell = self.mesh.topology.dim

@@ -16,8 +16,18 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import planning
-from complexbody.errors import SceneError, SolverError
+from complexbody.boundary import try_histories
+from complexbody.errors import (
+    ComplexBodyError,
+    DivergenceError,
+    IntegratorError,
+    SceneError,
+    SolverError,
+    StepError,
+    agree,
+)
 from complexbody.files import CsvWriter
+from complexbody.given import is_flag, is_positive, is_whole, short
 from complexbody.instabilities import warn_of
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
@@ -81,6 +91,8 @@ def simulate(
         "until": until, "output": output, "ledger_steps": ledger_steps, "growth": growth,
         "progress": progress, "plan": plan, "quiet": quiet,
     }  # fmt: skip
+    if not isinstance(scene, Scene):
+        raise SceneError(f"simulate: the scene is {short(scene)}. Give a cb.Scene.")
     if accuracy is None:
         return Simulation(scene, integrator, **options).run()
     from complexbody.accuracy import Accurate  # it stands above: it makes simulations
@@ -88,14 +100,40 @@ def simulate(
     return Accurate(scene, accuracy, integrator, **options).run()
 
 
-def require_until(until: float) -> None:
-    """Refuse what is no end of a run.
+def check_options(
+    *,
+    until: Any,
+    output: Any = None,
+    ledger_steps: Any = None,
+    growth: Any = None,
+    **flags: Any,
+) -> None:
+    """Refuse options of :func:`simulate` that make no sense.
 
     Raises:
-        SceneError: for it.
+        SceneError: for the first of them.
     """
-    if not (np.isfinite(until) and until > 0):
-        raise SceneError(f"simulate: until is {until}. Give the end of the run in seconds, > 0.")
+    if not is_positive(until):
+        raise SceneError(
+            f"simulate: until is {short(until)}. Give the end of the run in seconds, > 0."
+        )
+    if output is not None and not isinstance(output, Output):
+        raise SceneError(f"simulate: output is {short(output)}. Give cb.Output(folder, …).")
+    if ledger_steps is not None and not (is_whole(ledger_steps) and ledger_steps > 0):
+        raise SceneError(
+            f"simulate: ledger_steps is {short(ledger_steps)}. Give a whole number, 1 or more."
+        )
+    if growth is not None and not is_positive(growth):
+        raise SceneError(f"simulate: growth is {short(growth)}. Give a number > 0, or None.")
+    for name, value in flags.items():
+        if name in FLAGS and not (is_flag(value) or (value is None and name != "plan")):
+            raise SceneError(f"simulate: {name} is {short(value)}. Give True or False.")
+
+
+#: Options of a simulation that are True or False.
+FLAGS = ("progress", "plan", "quiet")
+#: Whole numbers up to here are floats, so that t = n h is exact to round-off.
+MOST_STEPS = 2.0**53
 
 
 class Watch(Protocol):
@@ -139,19 +177,44 @@ class Simulation:
         watch: Watch | None = None,
     ) -> None:
         begun = clock.perf_counter()
-        require_until(until)
-        if ledger_steps is not None and ledger_steps < 1:
-            raise SceneError(f"simulate: ledger_steps is {ledger_steps}. Give 1 or more.")
-        self.method = method = integrator or Synchronous()
+        check_options(
+            until=until, output=output, ledger_steps=ledger_steps, growth=growth,
+            progress=progress, plan=plan, quiet=quiet,
+        )  # fmt: skip
+        integrator = Synchronous() if integrator is None else integrator
+        if not isinstance(integrator, Integrator):
+            raise IntegratorError(
+                f"simulate: integrator is {short(integrator)}. Give one, such as cb.AVI()."
+            )
+        self.method = integrator
         self.watch = watch
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
-        warn_of(self.problem, method, until)
+        try:
+            self._make_ready(plan, quiet, ledger_steps, growth, progress)
+        except ComplexBodyError:  # which all ranks have: closing is collective
+            self.problem.close()
+            raise
+        self.stats.set_up = clock.perf_counter() - begun
+
+    def _make_ready(
+        self,
+        plan: bool,
+        quiet: bool | None,
+        ledger_steps: int | None,
+        growth: float | None,
+        progress: bool | None,
+    ) -> None:
+        """All but the problem itself."""
+        until, output = self.until, self.output
+        for data in (self.problem.loads, self.problem.supports):
+            try_histories(self.comm, data.histories, until)
+        warn_of(self.problem, self.method, until)
         self.problem.quiet = plan if quiet is None else quiet
-        self.run_: Run = method.prepare(self.problem, until)
+        self.run_: Run = self.method.prepare(self.problem, until)
         self.problem.release()
-        self.plan = planning.of_run(self.problem, method) if plan else None
-        self.last = int(np.ceil(until / self.run_.step - 1e-9))
+        self.plan = planning.of_run(self.problem, self.method) if plan else None
+        self.last = _steps(until, self.run_.step)
         self.times = output.schedule(until) if output is not None else np.zeros(0)
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
         self.writer = Writer(self.problem.whole_action, output) if output is not None else None
@@ -174,7 +237,6 @@ class Simulation:
         self.every = ledger_steps or default_ledger_steps(
             self.stats.cells, self.comm.size, self.last
         )
-        self.stats.set_up = clock.perf_counter() - begun
 
     def _steps(self) -> dict[str, Array]:
         """Step and level of each of this rank's cells."""
@@ -195,6 +257,7 @@ class Simulation:
 
         Raises:
             DivergenceError: if the run blew up.
+            SceneError: if a history of the scene failed on the way.
             SolverError: if an implicit step has no solution; the last state is written as output,
                 and is ``result`` of the error.
             OutputError: if results cannot be written any more.
@@ -202,8 +265,12 @@ class Simulation:
         try:
             self._loop()
             return self._result()
-        except SolverError as error:
-            error.result = self._keep()
+        except (DivergenceError, SolverError) as error:
+            # A history that failed on some rank since the last row gave it NaN.
+            for data in (self.problem.loads, self.problem.supports):
+                agree(self.comm, data.failure)
+            if isinstance(error, SolverError):
+                error.result = self._keep()
             raise
         finally:
             self._close()
@@ -357,6 +424,21 @@ class Simulation:
                 thing.close()
         self.run_.close()
         self.problem.close()
+
+
+def _steps(until: float, step: float) -> int:
+    """Steps of a run.
+
+    Raises:
+        StepError: for more than a clock of whole steps can count to the last one.
+    """
+    steps = np.ceil(until / step - 1e-9)
+    if not steps < MOST_STEPS:
+        raise StepError(
+            f"The run would take {steps:.3g} steps of {step:.3g} s. Give a larger step, or an "
+            "earlier end."
+        )
+    return int(steps)
 
 
 def default_ledger_steps(cells: int, ranks: int, steps: int) -> int:

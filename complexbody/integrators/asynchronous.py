@@ -17,8 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody.errors import IntegratorError, StepError, agree
+from complexbody.given import is_positive, short
 from complexbody.integrators.exact_run import ExactRun
 from complexbody.integrators.exact_schedule import alike, span_length
+from complexbody.integrators.options import flags, one_of
 from complexbody.integrators.stiffened import reach, stiffen
 from complexbody.integrators.window_run import WindowRun
 from complexbody.integrators.windows import apart, divisions, graded, window_length
@@ -75,8 +77,10 @@ class AVI:
     inertia: ClassVar[str] = "number or k×k matrix; 0 where viscosity is positive"
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.safety) and 0 < self.safety):
-            raise StepError(f"AVI: safety is {self.safety}. Give a positive number, 0.45 or less.")
+        if not is_positive(self.safety):
+            raise StepError(
+                f"AVI: safety is {short(self.safety)}. Give a positive number, 0.45 or less."
+            )
         if self.schedule is None:
             plain = self.balanced is False or self.start == "one-sided"
             object.__setattr__(self, "schedule", "windows" if plain else "octaves")
@@ -85,11 +89,9 @@ class AVI:
             ("schedule", SCHEDULES),
             ("start", STARTS),
         ):
-            if getattr(self, name) not in allowed:
-                raise IntegratorError(
-                    f"AVI: {name}={getattr(self, name)!r} is not known. Give one of "
-                    f"{', '.join(allowed)}."
-                )
+            one_of(self, name, allowed)
+        flags(self, "unstable_ok", *(n for n in ("balanced", "corrected")
+                                     if getattr(self, n) is not None))  # fmt: skip
         exact, whole = self.schedule == "exact", self.start == "one-sided"
         octaves = self.schedule == "octaves"
         if self.balanced is None:

@@ -18,7 +18,9 @@ from mpi4py import MPI
 
 from complexbody.dampers import refuse_dampers
 from complexbody.errors import IntegratorError, StepError
+from complexbody.given import is_whole
 from complexbody.integrators.implicit_run import ImplicitRun
+from complexbody.integrators.options import flags, one_of, petsc_options, positive
 from complexbody.integrators.split_run import SplitRun
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
@@ -90,28 +92,22 @@ class Implicit:
     )
 
     def __post_init__(self) -> None:
-        for name, allowed in (
-            ("order", (1, 2)), ("quadrature", ("vertex", "consistent")),
-            ("solve", ("needed", "always")), ("forces", ("explicit", "implicit")),
-        ):  # fmt: skip
-            if getattr(self, name) not in allowed:
-                raise IntegratorError(
-                    f"Implicit: {name}={getattr(self, name)!r} is not known. Give one of "
-                    f"{', '.join(map(str, allowed))}."
-                )
-        for name in ("step", "safety", "tolerance", "iterations"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise StepError(f"Implicit: {name} is {value}. Give a positive number.")
+        one_of(self, "order", (1, 2))
+        one_of(self, "quadrature", ("vertex", "consistent"))
+        one_of(self, "solve", ("needed", "always"))
+        one_of(self, "forces", ("explicit", "implicit"))
+        positive(self, "step", "safety", "tolerance", "iterations")
+        if not is_whole(self.iterations):
+            raise StepError(f"Implicit: iterations is {self.iterations}. Give a whole number.")
+        flags(self, "monitor", "unstable_ok")
+        petsc_options(self)
         if self.forces == "implicit" and self.quadrature == "consistent":
             raise IntegratorError(
                 "Implicit: forces='implicit' has lumped inertia and viscosity. Use "
                 "quadrature='vertex', or forces='explicit'."
             )
 
-    def prepare(
-        self, problem: Problem, until: float
-    ) -> ImplicitRun | SynchronousRun | SplitRun:
+    def prepare(self, problem: Problem, until: float) -> ImplicitRun | SynchronousRun | SplitRun:
         """Choose the step and set up the run; collective.
 
         Raises:

@@ -167,8 +167,10 @@ class ImplicitRun(ForceRun):
         if why and node >= 0:
             nu = problem.scene.components_of("nu")
             place = np.round(problem.disc.position[node, : problem.disc.dim], 9).tolist()
+            indices = problem.scene.mesh.geometry.input_global_indices
+            number = indices[problem.disc.dof[node]]
             text = (
-                f", on rank {problem.comm.rank} at the node {place} with ν = "
+                f", on rank {problem.comm.rank} at node {number}, {place}, with ν = "
                 f"{problem.kernels.x[node, nu].tolist()}, ν̇ = {rates[node, nu].tolist()}"
             )
         first = next(t for t in problem.comm.allgather(f"{why}{text}") if t)
@@ -247,8 +249,9 @@ class ImplicitRun(ForceRun):
         if self.step > limit * (1 + 1e-9) and not self.method.unstable_ok:
             raise SolverError(
                 f"By t = {self.time:.6g} s the step {self.step:.3g} s is larger than T₀ = "
-                f"{limit:.3g} s of the inertia (γ = {self.range.gamma:.3g}): its solution need not "
-                "be the only one. Use a smaller step, or unstable_ok=True: the last state is kept."
+                f"{limit:.3g} s of the inertia (γ = {self.range.gamma:.3g}) in "
+                f"{self.range.place(self.method.order)}: its solution need not be the only one. "
+                "Use a smaller step, or unstable_ok=True: the last state is kept."
             )
 
     def summary(self) -> str:

@@ -41,6 +41,7 @@ import ufl
 from complexbody import hessian
 from complexbody.body import Body
 from complexbody.errors import IntegratorError
+from complexbody.given import is_finite, is_whole, short
 from complexbody.integrators import octaves
 from complexbody.integrators.local_leapfrog_run import LocalLeapfrogRun
 from complexbody.integrators.stiffened import reach, stiffen
@@ -88,13 +89,15 @@ class LocalLeapfrog:
 
     def __post_init__(self) -> None:
         Synchronous(self.step, self.safety, self.dissipation, self.start)  # refuses what it would
-        if not (np.isfinite(self.stabilisation) and self.stabilisation >= 0):
+        if not (is_finite(self.stabilisation) and self.stabilisation >= 0):
             raise IntegratorError(
-                f"LocalLeapfrog: stabilisation is {self.stabilisation}. Give a number, 0 or more."
+                f"LocalLeapfrog: stabilisation is {short(self.stabilisation)}. Give a number, "
+                "0 or more."
             )
-        if self.levels is not None and not 0 <= self.levels <= octaves.MOST:
+        levels = self.levels
+        if levels is not None and not (is_whole(levels) and 0 <= levels <= octaves.MOST):
             raise IntegratorError(
-                f"LocalLeapfrog: levels is {self.levels}. Give 0 to {octaves.MOST}, or None."
+                f"LocalLeapfrog: levels is {short(levels)}. Give 0 to {octaves.MOST}, or None."
             )
 
     @property

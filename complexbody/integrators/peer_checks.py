@@ -68,32 +68,6 @@ def given_step(method: Any, until: float) -> float:
     return divided(method.step, until)
 
 
-def positive(method: Any, *names: str) -> None:
-    """Refuse options of a peer that are given and not positive.
-
-    Raises:
-        StepError: naming the first.
-    """
-    for name in names:
-        value = getattr(method, name)
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise StepError(f"{type(method).__name__}: {name} is {value}. Give a positive number.")
-
-
-def one_of(method: Any, name: str, allowed: tuple[str, ...]) -> None:
-    """Refuse an option of a peer that is none of those allowed.
-
-    Raises:
-        IntegratorError: naming those that are.
-    """
-    value = getattr(method, name)
-    if value not in allowed:
-        raise IntegratorError(
-            f"{type(method).__name__}: {name}={value!r} is not known. Give one of "
-            f"{', '.join(allowed)}."
-        )
-
-
 def divided(step: float, until: float) -> float:
     """The step, shortened so that the end of the run falls on one."""
     return float(until / np.ceil(until / min(step, until) * (1 - 1e-12)))
