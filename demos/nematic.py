@@ -30,6 +30,7 @@ from typing import Any
 
 import numpy as np
 import ufl
+from _snapshots import on_grid
 from mpi4py import MPI
 from scipy.optimize import brentq
 from scipy.special import ellipk, ellipkinc
@@ -120,19 +121,14 @@ def picture(result: cb.Result, path: Path) -> None:
     """The cell between crossed polarisers, its director, growth and profile; rank 0 draws."""
     import matplotlib
 
-    mesh = result.scene.mesh
-    parts = mesh.comm.gather((mesh.geometry.x[:, :2], result.nu.x.array))
-    if mesh.comm.rank > 0:
+    grid = on_grid(result.nu)
+    if grid is None:
         return
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    x, theta = (np.concatenate(part) for part in zip(*parts, strict=True))
-    grid, inverse = np.unique(np.round(x / 1e-9).astype(int), axis=0, return_inverse=True)
-    values = np.zeros(len(grid))
-    values[inverse.ravel()] = theta
-    n = len(np.unique(grid[:, 1]))
-    values, x, y = values.reshape(-1, n).T, grid[::n, 0] / 1e3, grid[:n, 1] / 1e3  # in µm
+    x, y, values = 1e6 * grid[0], 1e6 * grid[1], grid[2][..., 0]
+    n = len(y)
     figure = plt.figure(figsize=(11, 6.2), layout="constrained")
     top, bottom = figure.subfigures(2, 1, height_ratios=(1.15, 1))
     ax, (left, right) = top.subplots(), bottom.subplots(1, 2)
