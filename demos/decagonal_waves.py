@@ -62,7 +62,7 @@ def scene(comm: Any, cells: int = 200) -> cb.Scene:
         return size * np.stack([part * pulse for part in along])
 
     mesh = rectangle(comm, (-HALF, -HALF), (HALF, HALF), cells)
-    start = cb.Initial(u_dot=lambda x: blob(x, (1.0, 0.4, 0.0), 1.0),
+    start = cb.Initial(u_dot=lambda x: blob(x, (1.0, -0.7, 0.0), 1.0),
                        nu=lambda x: blob(x, (1.0, 0.3), 1e-7))  # fmt: skip
     return cb.Scene(mesh, ALLOY, initial=start, name="blow on a decagonal quasicrystal")
 
