@@ -55,8 +55,8 @@ def scene(comm: Any, cells: int = 200, angle: float = 30.0) -> cb.Scene:
         return np.stack([0.6 * pulse, pulse])
 
     mesh = rectangle(comm, (-HALF, -HALF), (HALF, HALF), cells)
-    initial = cb.Initial(u_dot=blow)
-    return cb.Scene(mesh, body, initial=initial, name=f"blow on cracks at {angle:g} degrees (scaled)")
+    name = f"blow on cracks at {angle:g} degrees (scaled)"
+    return cb.Scene(mesh, body, initial=cb.Initial(u_dot=blow), name=name)
 
 
 def tilt(name: str) -> float:
@@ -98,7 +98,7 @@ def picture(result: cb.Result, path: Path) -> None:
     """Motion and the opening of cracks, and the speeds of sound by direction; rank 0 draws."""
     import matplotlib
 
-    exact, found, share = on_circle(result)
+    _, found, share = on_circle(result)
     grid = on_grid(result.u, result.nu)
     if grid is None:
         return
@@ -132,7 +132,8 @@ def picture(result: cb.Result, path: Path) -> None:
         struck = share[:, branch] > 0.1
         axes[2].plot(ANGLES[struck], found[struck, branch].real / CIRCLE, "o", ms=4, color=colour)
     axes[2].set_title("speeds of sound by direction:\nlines exact, points measured", fontsize=10)
-    axes[2].set_rlim(0, 1.1 * speed.max())
+    axes[2].set(rlim=(0, 1.1 * speed.max()), rticks=(0.5, 1.0, 1.5))
+    axes[2].set_rlabel_position(15)
     figure.suptitle(f"Blow on a microcracked plate, t = {result.time:g} (scaled units; cracks "
                     "lie as in the corners)")  # fmt: skip
     figure.savefig(path, dpi=100)

@@ -55,20 +55,23 @@ def kink(x: Any, t: float, way: int) -> tuple[Any, Any]:
     return nu, -2 * g * m / (E - v**2) * way * step
 
 
-# The body and its scene.
 def energy(U: Any, nu: Any, N: Any) -> Any:
+    """ρe."""
     return E * U[0, 0] ** 2 / 2 + ufl.inner(N, N) / 2 + g * U[0, 0] * (1 - ufl.cos(nu[0]))
 
 
 def potential(u: Any, nu: Any) -> Any:
+    """ρw: the wells."""
     return 1 - ufl.cos(nu[0])
 
 
 def both(x: Any, which: int, t: float = 0.0) -> Any:
+    """ν (0) or u (1) of two kinks at t, far from each other."""
     return kink(x[0], t, 1)[which] + kink(x[0], t, -1)[which]
 
 
 def rate(x: Any, which: int, dt: float = 1e-4) -> Any:
+    """Their rate at t = 0."""
     return (both(x, which, dt) - both(x, which, -dt)) / (2 * dt)
 
 
@@ -108,14 +111,14 @@ def picture(result: cb.Result, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     files = Results(result.folder)
-    nu, u = (np.array([files.series(name).values(step)[:, 0] for step in range(len(times))])
-             for name, times in ((name, files.series(name).times) for name in ("nu", "u")))
+    fields = [files.series(name) for name in ("nu", "u")]
+    nu, u = (np.array([f.values(step)[:, 0] for step in range(len(f.times))]) for f in fields)
     x = np.linspace(-HALF, HALF, nu.shape[1])
     shown = (((nu - 2 * np.pi) / np.pi, "slip (ν − 2π)/π", 2.0),
              (np.gradient(u, x, axis=1), "strain u′", 1.0))  # fmt: skip
     figure, axes = plt.subplots(1, 2, figsize=(11, 5), sharey=True, layout="constrained")
     for ax, (values, label, most) in zip(axes, shown, strict=True):
-        drawn = ax.pcolormesh(x, files.series("nu").times, values, cmap="RdBu_r", vmin=-most,
+        drawn = ax.pcolormesh(x, fields[0].times, values, cmap="RdBu_r", vmin=-most,
                               vmax=most, shading="gouraud", rasterized=True)  # fmt: skip
         figure.colorbar(drawn, ax=ax, label=label, extend="both")
         ax.set_xlabel("x")
