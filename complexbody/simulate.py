@@ -16,7 +16,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import planning
-from complexbody.boundary import try_histories
+from complexbody.amplitudes import try_histories
 from complexbody.errors import (
     ComplexBodyError,
     DivergenceError,
