@@ -44,6 +44,12 @@ class OutputError(ComplexBodyError, OSError):
     """Results cannot be written where the user asked."""
 
 
+class CheckpointError(ComplexBodyError):
+    """A run cannot be resumed: no checkpoint is whole, or of this scene; or none can be made."""
+
+    exit_code = 6
+
+
 class CommandError(ComplexBodyError):
     """The command line or a scene file is wrong."""
 

@@ -18,6 +18,7 @@ from mpi4py import MPI
 from complexbody import native
 from complexbody.integrators.exact_schedule import ExactSchedule
 from complexbody.integrators.records import RecordRun, World
+from complexbody.integrators.snapshot import Snapshot, to_blocks, to_cells
 from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.problem import Problem
 
@@ -54,6 +55,16 @@ class ExactRun(RecordRun):
         self._rows = np.arange(disc.shared, dtype=np.int32)
         self._touched = self._touched_nodes()
         self._sampled: tuple[int, float] | None = None
+
+    def snapshot(self) -> Snapshot:
+        """The run between two spans, with its cells' counters."""
+        saved = super().snapshot()
+        saved.cells["counter"] = to_cells(self.problem.disc, self.schedule.counters())
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.schedule.set(to_blocks(self.problem.disc, saved.cells["counter"]))
+        self._sampled = None
 
     def _touched_nodes(self) -> npt.NDArray[np.int32]:
         """Nodes that loads or moving supports act on, on any rank."""

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from complexbody import native
 from complexbody.integrators.activity import Counted
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
 
@@ -78,6 +79,32 @@ class ForceRun(Counted):
     def positions(self) -> Array:
         """(u, ν) at t_n, node records."""
         return self.problem.kernels.x
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two steps; arrays are views, valid until a step; collective."""
+        kernels, n = self.problem.kernels, self.problem.disc.n
+        return Snapshot(
+            {"steps": self.steps, "ready": self.ready},
+            nodes={"x": kernels.x[:-1, :n], "v": kernels.v[:-1, :n]},
+            sums={"sums": kernels.sums, "counts": self._counts()},
+        )
+
+    def restore(self, saved: Snapshot) -> None:
+        """Go on from a snapshot of a run of the same scene, step and options; collective."""
+        kernels, n = self.problem.kernels, self.problem.disc.n
+        kernels.x[:-1, :n], kernels.v[:-1, :n] = saved.nodes["x"], saved.nodes["v"]
+        kernels.sums[:] = saved.sums["sums"]
+        self.steps, self.ready = int(saved.numbers["steps"]), False
+        kernels.reset_forces()
+        self._refresh(saved)
+        if saved.numbers["ready"]:
+            self.forces()
+        self._recount(saved.sums["counts"])
+
+    def _refresh(self, saved: Snapshot) -> None:
+        """Take what else a kind of run has in a snapshot, before forces."""
 
     def close(self) -> None:
         """Do nothing: messages are the problem's."""

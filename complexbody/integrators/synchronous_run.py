@@ -19,6 +19,7 @@ from complexbody.errors import IntegratorError
 from complexbody.integrators.activity import ENOUGH, Activity, active
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.force_run import ForceRun
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.synchronous_books import entries
 from complexbody.kernels.library import State
 from complexbody.problem import Problem
@@ -64,6 +65,7 @@ class SynchronousRun(ForceRun):
         kernels.select(masses.diagonal, masses.damped)
         self.c = kernels.c
         self.watched: State | None = None
+        self._watching = False
         rec = masses.recursion(step, method.dissipation)
         if method.start == "one-sided":
             # Kicks sit at the left ends of intervals: momenta at t_n are those before the kick.
@@ -95,11 +97,14 @@ class SynchronousRun(ForceRun):
         self.state = ctypes.byref(self._own)
 
     def watch(self) -> None:
-        """Skip what is quiet from now on, if enough is; before the first step."""
+        """Skip what is quiet from now on, if enough is; between steps."""
         problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
+        self.activity, self.watched, self._watching = None, None, True
+        self._own.activity = None
         if not (problem.quiet and disc.blocks):
             return
-        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
+        rates = kernels.v[:-1, : disc.n] if self.steps else problem.initial_rates
+        stirred = (kernels.x[:-1, : disc.n] != 0) | (rates != 0)
         stirred = (stirred | (kernels.f[:-1, : disc.n] != 0)).any(axis=1)
         stirred[problem.load_position // disc.record] = True
         if active(disc.cells, stirred) > ENOUGH:
@@ -225,6 +230,10 @@ class SynchronousRun(ForceRun):
         kernels.reset_forces()
         self.steps, self.ready = 1, False
         self.c.cb_look(self.state)
+
+    def _refresh(self, saved: Snapshot) -> None:
+        if self._watching:
+            self.watch()
 
     # --- what a user sees at t_n -------------------------------------------------------------
 
