@@ -8,6 +8,7 @@ dissipation: variational integrators and convergence* ("the paper" in docstrings
 """
 
 from complexbody.body import Body
+from complexbody.checkpoint import Checkpoint
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import constant, ramp, ricker, sine, step, table
 from complexbody.integrators.asynchronous import AVI
@@ -32,6 +33,7 @@ __all__ = [
     "Body",
     "BodyForce",
     "Chart",
+    "Checkpoint",
     "ComplexBodyError",
     "Fix",
     "Implicit",

@@ -111,11 +111,13 @@ class Found:
 
     Attributes:
         path: The file; about: its description; arrays: what it has, on rank 0 only.
+        same: Whether ranks have the same cells as then, in the same order.
     """
 
     path: Path
     about: dict[str, Any]
     arrays: Mapping[str, Array] | None
+    same: bool = False
 
     def require(self, step: float, until: float) -> None:
         """Refuse to go on with another step, or to an end that has passed.
@@ -137,7 +139,7 @@ class Found:
     def snapshot(self, numbering: Numbering) -> Snapshot:
         """This rank's share of the run's state; collective."""
         # Sums belong to ranks as long as these have the same cells.
-        same = numbering.layout == self.about["layout"]
+        same = self.same = numbering.layout == self.about["layout"]
 
         def mine(kind: str, name: str, _: Any) -> Array:
             table = None if self.arrays is None else self.arrays[f"{kind}/{name}"]
@@ -318,8 +320,9 @@ class Keeper:
         if steps < self._next and not counted:
             return
         now = clock.monotonic()
-        mine = [float(self._signal), now - self._begun, now - self._last]
-        asked, elapsed, since = self.comm.allreduce(np.array(mine), op=MPI.MAX)
+        found = np.array([float(self._signal), now - self._begun, now - self._last])
+        self.comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+        asked, elapsed, since = found
         if steps > self._seen:
             wanted = int(LOOK * (steps - self._seen) / max(elapsed, 1e-9))
             self.stride = max(1, min(wanted, 2 * self.stride))

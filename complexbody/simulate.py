@@ -142,6 +142,7 @@ class Simulation:
         problem, run_: The scene made ready, and the integrator's run.
         every: Steps between two ledger rows.
         stats: Filled in as far as known before the run.
+        resumed: The checkpoint that it goes on from, or None.
     """
 
     stats: Statistics
@@ -180,6 +181,7 @@ class Simulation:
         if resume:
             place = (checkpoint or Checkpoint()).place(output) if resume is True else resume
             found = find(place, self.problem, method, known)
+        self.resumed = found
         # A run keeps the step that it began with.
         self.begun_for = until if found is None else float(found.about["until"])
         self.run_: Run = method.prepare(self.problem, self.begun_for)
