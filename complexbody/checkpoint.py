@@ -211,7 +211,7 @@ def _foreign(
     if not what:
         return ""
     return (
-        f"{path} is of another run: it has {what}. Resume with the scene and the integrator that "
+        f"{path} is of another run: it has {what}. Use the scene and the integrator that "
         "it was made with."
     )
 

@@ -25,7 +25,6 @@ from complexbody.checkpoint import (
     Keeper,
     described,
     find,
-    require_snapshots,
 )
 from complexbody.errors import AccuracyError, DivergenceError, SceneError, SolverError
 from complexbody.files import CsvWriter
@@ -188,11 +187,16 @@ class Simulation:
         self.problem.release()
         if found is not None:
             found.require(self.run_.step, until)
+            self.run_.restore(found.snapshot(Numbering(self.problem.disc)))
         self.plan = planning.of_run(self.problem, method) if plan else None
         self.last = int(np.ceil(until / self.run_.step - 1e-9))
         self.times = output.schedule(until) if output is not None else np.zeros(0)
-        if folder is not None:
-            require_snapshots(self.run_)
+        self.keeper: Keeper | None = None
+        if checkpoint is not None and folder is not None:
+            self.keeper = Keeper(
+                self.problem, self.run_, checkpoint, folder, self._about(known), self._describe,
+                self._settle, fresh=found is None,
+            )  # fmt: skip
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
         written = None if found is None else float(found.about["written"])
         self.writer = (
@@ -221,12 +225,6 @@ class Simulation:
         )
         if found is not None:
             self._resume(found)
-        self.keeper: Keeper | None = None
-        if checkpoint is not None and folder is not None:
-            self.keeper = Keeper(
-                self.problem, self.run_, checkpoint, folder, self._about(known), self._describe,
-                self._settle, fresh=found is None,
-            )  # fmt: skip
         self.stats.set_up += clock.perf_counter() - begun
 
     # --- checkpoints ---------------------------------------------------------------------------
@@ -239,15 +237,14 @@ class Simulation:
             output = {k: v for k, v in output.items() if k != "folder"}
         return {
             "identity": known, "integrator": described(self.method), "until": self.begun_for,
-            "end": self.until, "output": output, "every": self.every,
-            "versions": machine.versions(),
+            "end": self.until, "output": output, "versions": machine.versions(),
         }  # fmt: skip
 
     def _describe(self) -> Description:
         """What a checkpoint keeps of the simulation around the run."""
         rows = len(self.books.ledger)
         about = {
-            "books": self.books.state(), "written": self._written,
+            "books": self.books.state(), "written": self._written, "every": self.every,
             "noted": self._noted == self.run_.steps, "statistics": asdict(self.stats),
         }  # fmt: skip
         return about, {"ledger": lambda: np.array(self.books.ledger.rows[:rows])}
@@ -264,7 +261,6 @@ class Simulation:
     def _resume(self, found: Found) -> None:
         """Go on from a checkpoint; collective."""
         about = found.about
-        self.run_.restore(found.snapshot(Numbering(self.problem.disc)))
         rows = None if found.arrays is None else found.arrays["ledger"]
         rows = np.asarray(self.comm.bcast(rows)).reshape(-1, len(self.books.ledger.columns))
         self.books.restore(about["books"], rows)
@@ -347,6 +343,8 @@ class Simulation:
                 self._advance(stop - run.steps)
                 self._note()
             if pending and pending[0] < (run.steps + 1) * run.step - tiny:
+                if self.keeper is not None:
+                    self.keeper.look()
                 pending = self._between(pending, tiny)
         self.progress.update(self.until, run.steps)
 
