@@ -31,9 +31,9 @@ exit codes:
 """
 RUN_EPILOG = """\
 Options that are not given are taken from DEFAULTS of the scene file, then as shown here. Results go
-to DIR: run.json (what was run, and how it ended), ledger.csv, FIELD.xdmf with FIELD*.h5 (open the
-.xdmf in ParaView), probe-NAME.csv, checkpoints and picture.png. Ctrl-C and SIGTERM make a checkpoint
-and end the run, SIGUSR1 makes one and goes on; kill -9 at any moment leaves all readable.
+to DIR: run.json (what was run, and how it ended), ledger.csv, FIELD.xdmf with FIELD*.h5 (open
+the .xdmf in ParaView), probe-NAME.csv, checkpoints and picture.png. Ctrl-C and SIGTERM make a
+checkpoint and end the run, SIGUSR1 makes one and goes on; kill -9 leaves all readable.
 
 examples:
   complexbody run demos/impact.py --set refine=1.5 --every 1e-7 --out results/fine

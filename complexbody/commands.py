@@ -38,9 +38,9 @@ from complexbody.precheck import realised_speed_up
 from complexbody.problem import Problem
 from complexbody.rendering import require_vtk
 from complexbody.result import Result
+from complexbody.runfolder import recorded_words
 from complexbody.scene import Scene
 from complexbody.scenefile import CheckFailed, SceneFile, assignments, points
-from complexbody.runfolder import recorded_words
 from complexbody.simulate import Simulation, default_ledger_steps
 from complexbody.together import Interrupted, say, together
 

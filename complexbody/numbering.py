@@ -24,7 +24,7 @@ PIECE = 64 << 20
 _TAG = 71
 
 
-def weights(numbers: Ints, seed: int = 0) -> npt.NDArray[np.float64]:
+def weights(numbers: npt.NDArray[Any], seed: int = 0) -> npt.NDArray[np.float64]:
     """A number in [-1, 1) for each number: the splitmix64 hash of it and the seed."""
     z = np.asarray(numbers, dtype=np.uint64) + np.uint64((seed + 1) * 0x9E3779B97F4A7C15 % 2**64)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):

@@ -78,7 +78,7 @@ def _h5py() -> Any:
 
 
 class Series:
-    """The steps of one field: ``<path>.h5``, ``<path>-<step>.h5``, … and their index ``<path>.xdmf``.
+    """The steps of one field: ``<path>.h5``, ``<path>-<step>.h5``, … and the index ``<path>.xdmf``.
 
     For one process. HDF5 never writes to the disk itself: it survives neither a kill in the middle
     nor a full disk.
@@ -130,7 +130,8 @@ class Series:
                 file["Mesh/mesh/geometry"], file["Mesh/mesh/topology"] = points, cells
             elif not np.array_equal(file["Mesh/mesh/topology"], cells):
                 raise OutputError(f"Output: {self._open} has results on another mesh. {ANOTHER}")
-            parts = {part: self._item(file[f"Mesh/mesh/{part}"]) for part in ("topology", "geometry")}
+            both = ("topology", "geometry")
+            parts = {part: self._item(file[f"Mesh/mesh/{part}"]) for part in both}
         if resume is None or not self._open.exists():
             replace(self._open, self._content.getbuffer())
         return parts

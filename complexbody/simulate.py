@@ -18,14 +18,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import machine, planning
-from complexbody.checkpoint import (
-    Checkpoint,
-    Description,
-    Found,
-    Keeper,
-    described,
-    find,
-)
+from complexbody.checkpoint import Checkpoint, Found, described, find
 from complexbody.errors import AccuracyError, DivergenceError, SceneError, SolverError
 from complexbody.files import CsvWriter
 from complexbody.identity import identity
@@ -36,6 +29,7 @@ from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
+from complexbody.keeper import Description, Keeper
 from complexbody.ledger import Bookkeeper
 from complexbody.numbering import Numbering
 from complexbody.output import Output, Writer
@@ -85,8 +79,8 @@ def simulate(
             and ν (L2), over their largest norms (:mod:`complexbody.accuracy`).
         checkpoint: When to make checkpoints; none by default.
         resume: Go on from the newest good checkpoint of this scene: True for that of ``checkpoint``
-            and ``output``, or a folder of a run, or a file. The step stays that of its run, whatever
-            ``until`` is; files go on where they were then.
+            and ``output``, or a folder of a run, or a file. The step stays that of its run,
+            whatever ``until`` is; files go on where they were then.
 
     Returns:
         Fields at the final time, ledger, probes and statistics.

@@ -66,7 +66,7 @@ def write(path: Path, about: Mapping[str, Any], arrays: Iterator[tuple[str, Arra
             with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
                 for name, array in arrays:
                     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                        np.lib.format.write_array(member, np.asarray(array), allow_pickle=False)
+                        np.save(member, np.asarray(array), allow_pickle=False)
                 text = json.dumps({"format": FORMAT, **about}, default=_plain)
                 archive.writestr(_ABOUT, text)
                 archive.comment = b"0" * _DIGEST

@@ -38,7 +38,7 @@ def cut(comm, old, new, which):
 
 
 def by_number(function):
-    """Values by the nodes' numbers in the mesh's input, those that this rank has: (numbers, values)."""
+    """Numbers in the mesh's input of this rank's nodes, and their values."""
     mesh = function.function_space.mesh
     values = function.x.array.reshape(_compat.node_count(mesh), -1)
     return np.asarray(mesh.geometry.input_global_indices), values
@@ -65,7 +65,8 @@ def same_files(comm, one, other):
         for name in ("ledger.csv", "probe-inside.csv"):
             assert (one / name).read_bytes() == (other / name).read_bytes()
         for name in ("u", "nu_dot", "stress"):
-            for first, second in zip(*(read(f / f"{name}.xdmf")[2] for f in (one, other)), strict=True):
+            both = (read(folder / f"{name}.xdmf")[2] for folder in (one, other))
+            for first, second in zip(*both, strict=True):
                 assert first[:2] == second[:2]
                 np.testing.assert_array_equal(first[2], second[2])
     comm.barrier()

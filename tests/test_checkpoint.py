@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""A run resumed from a checkpoint is the run that was never stopped: to the bit on as many ranks."""
+"""A run resumed from a checkpoint is one that was never stopped: to the bit on as many ranks."""
 
 import numpy as np
 import pytest
@@ -124,7 +124,8 @@ def test_quiet_cells_on_any_ranks(comm, shared_path, method):
     """A pulse that has reached a part of the body: what is quiet stays so, and no bit changes."""
 
     def energy(U, nu, N):
-        return 0.5 * sum(U[0, j] ** 2 + N[0, j] ** 2 for j in range(3)) + 0.2 * (U[0, 0] + nu[0]) ** 2
+        squares = sum(U[0, j] ** 2 + N[0, j] ** 2 for j in range(3))
+        return 0.5 * squares + 0.2 * (U[0, 0] + nu[0]) ** 2
 
     mesh = meshes.jiggled(meshes.rectangle(comm, (0, 0), (12, 1), (240, 6)), 0.2)
     scene = cb.Scene(
@@ -149,7 +150,7 @@ def test_other_numbers_of_ranks(comm, shared_path, case):
         return simulated(scene, method, until, folder, checkpoint=keep, **more)
 
     reference = run(MPI.COMM_SELF, shared_path / f"alone-{comm.rank}")
-    numbers, values = by_number(reference.u)
+    numbers, _ = by_number(reference.u)
     assert np.array_equal(np.sort(numbers), np.arange(len(numbers)))
 
     def same(result, ranks):

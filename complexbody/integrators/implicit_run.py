@@ -190,7 +190,8 @@ class ImplicitRun(ForceRun):
         self.previous[:-1, : self.problem.disc.n] = saved.nodes["previous"]
         self.momentum[:] = saved.nodes["momentum"]
         newton, numbers = saved.sums["newton"][0], saved.numbers
-        self.count[:], self.linear = (newton, numbers["most"], numbers["solved"]), numbers["linear"]
+        self.count[:] = newton, numbers["most"], numbers["solved"]
+        self.linear = int(numbers["linear"])
         for name in vars(self.range):
             setattr(self.range, name, numbers[name])
 

@@ -75,8 +75,8 @@ class Books:
         )
         self._before = None
         if saved.numbers["before"]:
-            amplitude = self.run.amplitude((self.run.steps - 1) * self.run.step + 0.5 * self.run.step)
-            nodes = saved.nodes
+            h, nodes = self.run.step, saved.nodes
+            amplitude = self.run.amplitude((self.run.steps - 1) * h + 0.5 * h)
             self._before = nodes["middle"], nodes["rate_before"], nodes["force"], amplitude
 
     # --- one step ------------------------------------------------------------------------------
