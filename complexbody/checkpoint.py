@@ -100,8 +100,14 @@ class Found:
 
     path: Path
     about: dict[str, Any]
-    arrays: Mapping[str, Array] | None
+    arrays: Any
     same: bool = False
+
+    def close(self) -> None:
+        """Close the file."""
+        if self.arrays is not None:
+            self.arrays.close()
+            self.arrays = None
 
     def require(self, step: float, until: float) -> None:
         """Refuse to go on with another step, or to an end that has passed.

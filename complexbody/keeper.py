@@ -83,7 +83,7 @@ class Keeper:
 
         def prepare() -> None:
             folder.mkdir(parents=True, exist_ok=True)
-            for path in folder.glob("step-*.npz*" if fresh else "step-*.part"):
+            for path in list(folder.glob("step-*.npz*" if fresh else "step-*.part")):
                 path.unlink()
 
         on_first_rank(self.comm, folder, prepare)

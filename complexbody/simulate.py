@@ -263,6 +263,7 @@ class Simulation:
         self._noted = self.run_.steps if about["noted"] else -1
         for name in ("set_up", "stepping", "booking", "writing", "saving"):
             setattr(self.stats, name, float(about["statistics"][name]))
+        found.close()
 
     def _steps(self) -> dict[str, Array]:
         """Step and level of each of this rank's cells."""
@@ -424,7 +425,9 @@ class Simulation:
         return self._made(self.run_.time, self.run_.positions(), self.problem.kernels.v)
 
     def _result(self) -> Result:
-        self._book()
+        rows = self.books.ledger.rows
+        if not rows or rows[-1][0] != self.run_.time:  # there already if it was killed at the end
+            self._book()
         return self._made(self.until, *self._final())
 
     def _made(self, t: float, x: Array, rates: Array) -> Result:

@@ -76,6 +76,8 @@ def test_a_later_end(comm, shared_path):
     """A finished run goes on: the same as one that was to last so long, with the same step."""
     scene = plain_scene(comm)
     whole = simulated(scene, METHOD, 0.8, shared_path / "whole", checkpoint=STEPS)
+    again = simulated(scene, METHOD, 0.8, shared_path / "whole", checkpoint=STEPS, resume=True)
+    same_result(comm, whole, again)  # nothing is left to be done, and nothing is done twice
     folder = shared_path / "short"
     simulated(scene, METHOD, 0.5, folder, checkpoint=STEPS)
     resumed = simulated(scene, METHOD, 0.8, folder, checkpoint=STEPS, resume=True)
@@ -186,4 +188,4 @@ def test_a_disk_that_is_full(comm, tmp_path):
         same_result(comm, whole, resumed)
         same_files(comm, tmp_path / "whole", folder)
     finally:
-        subprocess.run(["umount", str(tmp_path)], check=False)
+        subprocess.run(["umount", "-l", str(tmp_path)], check=False)
