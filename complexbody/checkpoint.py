@@ -100,14 +100,8 @@ class Found:
 
     path: Path
     about: dict[str, Any]
-    arrays: Any
+    arrays: Mapping[str, Array] | None
     same: bool = False
-
-    def close(self) -> None:
-        """Close the file."""
-        if self.arrays is not None:
-            self.arrays.close()
-            self.arrays = None
 
     def require(self, step: float, until: float) -> None:
         """Refuse to go on with another step, or to an end that has passed.

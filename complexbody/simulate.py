@@ -263,7 +263,6 @@ class Simulation:
         self._noted = self.run_.steps if about["noted"] else -1
         for name in ("set_up", "stepping", "booking", "writing", "saving"):
             setattr(self.stats, name, float(about["statistics"][name]))
-        found.close()
 
     def _steps(self) -> dict[str, Array]:
         """Step and level of each of this rank's cells."""

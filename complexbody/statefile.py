@@ -101,14 +101,32 @@ def read(path: Path) -> tuple[dict[str, Any], Mapping[str, Array]]:
         raise CheckpointError(f"{path} cannot be read ({error}). Use an older one.") from error
     if not whole:
         raise CheckpointError(f"{path} is damaged: its checksum is wrong. Use an older one.")
-    arrays = np.load(path, allow_pickle=False)
-    about = json.loads(arrays[_ABOUT])
+    with zipfile.ZipFile(path) as archive:
+        about = json.loads(archive.read(_ABOUT))
     if about["format"] != FORMAT:
         raise CheckpointError(
             f"{path} has format {about['format']}, and this version reads {FORMAT}. Use the "
             f"version that wrote it ({about.get('versions', {}).get('complexbody', 'unknown')})."
         )
-    return about, arrays
+    return about, Arrays(path)
+
+
+class Arrays(Mapping[str, Array]):
+    """The arrays of a checkpoint, read when they are asked for."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __getitem__(self, name: str) -> Array:
+        with np.load(self._path, allow_pickle=False) as archive:
+            return np.asarray(archive[name])
+
+    def __iter__(self) -> Iterator[str]:
+        with np.load(self._path, allow_pickle=False) as archive:
+            return iter([name for name in archive.files if name != _ABOUT])
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
 
 
 def _digest(file: Any, count: int) -> str:
