@@ -14,6 +14,14 @@ from complexbody.errors import CheckpointError
 from complexbody.problem import Problem
 from complexbody.timesets import critical_step
 
+SLOW = pytest.mark.slow
+
+
+def cases(known, *fast):
+    """Names of cases, those that are not fast left to `make verify`."""
+    return [name if name in fast else pytest.param(name, marks=SLOW) for name in known]
+
+
 SYNCHRONOUS = {
     "exact": ("numbers", 0.0, cb.Synchronous()),
     "blocks, forward": ("blocks", 0.0, cb.Synchronous(dissipation="forward")),
@@ -54,16 +62,16 @@ def whole_and_cut(comm, scene, method, until, folder, each, which, **options):
     return whole
 
 
-@pytest.mark.parametrize("case", SYNCHRONOUS)
-def test_synchronous_on_any_ranks(comm, shared_path, case):
+@pytest.mark.parametrize("case", cases(SYNCHRONOUS, "exact", "nonlinear, symmetric"))
+def test_synchronous(comm, shared_path, case):
     kind, quartic, method = SYNCHRONOUS[case]
     scene = busy(comm, 2, kind, quartic)
     until = 23.4 * critical_step(Problem(scene), method.dissipation)
     whole_and_cut(comm, scene, method, until, shared_path, 5, (0, 2))
 
 
-@pytest.mark.parametrize("case", LOCAL)
-def test_local_steps_on_any_ranks(comm, shared_path, case):
+@pytest.mark.parametrize("case", cases(LOCAL, "balanced", "real steps", "local leapfrog"))
+def test_local_steps(comm, shared_path, case):
     kind, quartic, method = LOCAL[case]
     scene = busy(comm, 2, kind, quartic)
     until = 40.4 * critical_step(Problem(scene), method.dissipation)
@@ -87,8 +95,8 @@ def plain_scene(comm, nonlinear=False):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("case", IMPLICIT)
-def test_implicit_on_any_ranks(comm, shared_path, case):
+@pytest.mark.parametrize("case", cases(IMPLICIT, "midpoint", "forces"))
+def test_implicit(comm, shared_path, case):
     kind, quartic, method = IMPLICIT[case]
     scene = busy(comm, 2, kind, quartic)
     whole_and_cut(comm, scene, method, 17.4 * method.step, shared_path, 5, (0, 2))
@@ -102,8 +110,8 @@ PEERS = {
 }
 
 
-@pytest.mark.parametrize("case", PEERS)
-def test_peers_on_any_ranks(comm, shared_path, case):
+@pytest.mark.parametrize("case", cases(PEERS, "matrix", "newmark"))
+def test_peers(comm, shared_path, case):
     nonlinear, method = PEERS[case]
     scene = plain_scene(comm, nonlinear)
     whole_and_cut(comm, scene, method, 17 * method.step, shared_path, 5, (0, 2))
@@ -118,9 +126,11 @@ def test_petsc_keeps_its_state_to_itself(comm, shared_path):
 
 
 @pytest.mark.parametrize(
-    "method", [cb.Synchronous(), cb.AVI(), cb.AVI(balanced=False)], ids=("one step", "avi", "plain")
+    "method",
+    [cb.Synchronous(), cb.AVI(), pytest.param(cb.AVI(balanced=False), marks=SLOW)],
+    ids=("one step", "avi", "plain"),
 )
-def test_quiet_cells_on_any_ranks(comm, shared_path, method):
+def test_quiet_cells(comm, shared_path, method):
     """A pulse that has reached a part of the body: what is quiet stays so, and no bit changes."""
 
     def energy(U, nu, N):
@@ -136,7 +146,10 @@ def test_quiet_cells_on_any_ranks(comm, shared_path, method):
     assert 0.2 < whole.stats.quiet < 0.95
 
 
-@pytest.mark.parametrize("case", ["synchronous", "balanced", "real steps", "implicit", "newmark"])
+@pytest.mark.parametrize(
+    "case",
+    cases(["synchronous", "balanced", "real steps", "implicit", "newmark"], "synchronous", "balanced"),
+)
 def test_other_numbers_of_ranks(comm, shared_path, case):
     """1 to all, all to 1, and 3 to 2 ranks: the same to round-off."""
     method = {
