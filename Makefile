@@ -35,17 +35,17 @@ demo: setup ## an impact, computed and drawn (results/impact)
 # On graded meshes peers get more time per point first, else hardly any would be on the finest.
 CHART = $(PYTHON) -m complexbody chart benchmarks/scenes/$(1).py --out docs/charts/$(1)
 PEERS = --methods assembly,matrix,petsc-rk4,petsc-alpha2,petsc-cn,newmark \
-	--steps 2 --budget 15 --repeats 1
+	--steps 2 --repeats 1 --budget
 NOTCH = --meshes refine=0.3,0.5,0.8
 PLATE = --meshes refine=0.3,0.45,0.6
 
-charts: setup ## speed against accuracy on four scenes (docs/charts), serially, some 20 minutes
+charts: setup ## speed against accuracy on four scenes (docs/charts), serially, an hour
 	$(call CHART,bar) --meshes cells=100,200,400,800 --steps 5 --budget 3
 	$(call CHART,phason) --meshes cells=20,40,80 --steps 5 --budget 3
-	$(call CHART,notch) $(NOTCH) $(PEERS)
-	$(call CHART,notch) $(NOTCH) --steps 5 --budget 4
-	$(call CHART,plate) $(PLATE) $(PEERS)
-	$(call CHART,plate) $(PLATE) --steps 4 --budget 6
+	$(call CHART,notch) $(NOTCH) $(PEERS) 60
+	$(call CHART,notch) $(NOTCH) --steps 5 --budget 10
+	$(call CHART,plate) $(PLATE) $(PEERS) 100
+	$(call CHART,plate) $(PLATE) --steps 4 --budget 15
 
 # One half of the serial tests; the other takes what is left, in about the same time.
 HALF := $(wildcard tests/test_*.py tests/verification/test_windows*.py) tests/forms tests/kernels \

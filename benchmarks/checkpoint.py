@@ -4,9 +4,10 @@
     [mpirun -n 2] python benchmarks/checkpoint.py [--cells 100000] [--steps 400]
 
 A cube of icosahedral quasicrystal that rings. The first number is the wall time of making one
-checkpoint over the default interval of 600 s; the second is what all but the checkpoints cost (looks
-at the clock and for signals, copies of states whose books were in order): the time of steps and books
-with checkpoints switched on but none due, over that without, the smallest of three each, in turn.
+checkpoint over the default interval of 600 s; the second is what all but the checkpoints cost
+(looks at the clock and for signals, copies of states whose books were in order): the time of steps
+and books with checkpoints switched on but none due, over that without, the smallest of three each,
+in turn.
 """
 
 from __future__ import annotations

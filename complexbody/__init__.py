@@ -21,6 +21,7 @@ from complexbody.planning import Plan, plan
 from complexbody.precheck import realised_speed_up
 from complexbody.result import Result
 from complexbody.scene import BodyForce, Fix, Initial, Pressure, Scene, Traction
+from complexbody.show import Look, show
 from complexbody.simulate import simulate
 from complexbody.stability import stability
 from complexbody.workprecision import Chart, chart
@@ -39,6 +40,7 @@ __all__ = [
     "Implicit",
     "Initial",
     "LocalLeapfrog",
+    "Look",
     "Newmark",
     "Output",
     "PetscTS",
@@ -54,6 +56,7 @@ __all__ = [
     "ramp",
     "realised_speed_up",
     "ricker",
+    "show",
     "simulate",
     "sine",
     "stability",

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from mpi4py import MPI
 
-from complexbody import __version__, cli_chart, cli_plan, cli_stability, commands
+from complexbody import __version__, cli_chart, cli_plan, cli_show, cli_stability, commands
 from complexbody.cli_texts import EPILOG, RESUME_EPILOG, RUN_EPILOG
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
@@ -103,6 +103,7 @@ def parser() -> argparse.ArgumentParser:
     _integrator(planned)
     cli_stability.declare(command)
     cli_chart.add(command, _scene)
+    cli_show.declare(command)
     command("info", commands.info, "versions, compiler, caches, and which optional parts are there")
     return main
 

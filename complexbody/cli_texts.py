@@ -10,6 +10,7 @@ examples:
   mpirun -n 4 complexbody run demos/impact.py     the same on four processes
   complexbody resume results/fine                 go on with a run that was stopped
   complexbody chart demos/graded_crack.py         which method is the cheapest for which error?
+  complexbody show results/impact                 pictures of its fields, energies and probes
   complexbody info                                versions, compiler, what is missing
 
 a scene file is a Python file with

@@ -9,63 +9,44 @@ no ranks. Matplotlib and pyvista are imported where they are used: both are opti
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from complexbody._compat import Array, Ints
+from complexbody._compat import Array
 from complexbody.rendering import View, image
+from complexbody.scales import SYMBOLS, Panel, Shown, Visible, prefixed
+
+__all__ = ["Drawing", "Frame", "Panel", "Visible", "displacement", "draw", "factor_of"]
 
 WIDTH, DPI = 10.0, 160  # inches and pixels per inch
-_SYMBOLS = {"u": "u", "nu": r"\nu", "u_dot": r"\dot{u}", "nu_dot": r"\dot{\nu}"}
-_UNITS = {"u": "m", "u_dot": "m/s"}
-#: Units that take a prefix: it belongs to their first symbol alone.
-_SCALABLE = ("m", "m/s", "s", "Pa", "N", "J/m³", "Hz")
-_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
-_STYLE = {"font.size": 11.0, "axes.linewidth": 0.6, "axes.edgecolor": "0.4"}
+STYLE = {"font.size": 11.0, "axes.linewidth": 0.6, "axes.edgecolor": "0.4"}
 _DEFORMATION = 0.06  # largest displacement in the picture, over the size of the body
 
 
 @dataclass(frozen=True)
-class Panel:
-    """One view of the body.
+class Frame:
+    """How a picture is framed.
 
     Attributes:
-        field: Name of the function that gives the colours.
-        component: A component (from 0), or "norm"; by default the norm of a vector, the value of a
-            scalar, and in one dimension all components.
-        warp: Name of the function that deforms the body, by a factor the picture tells; or None.
-        label: What to call the colours; by default the symbol of the field.
-        unit: Their unit; by default m for u, m/s for its rate.
+        factors: How many times as large displacements are drawn, by name of the field; those of
+            others are chosen to be visible.
+        view: What is seen; by default all of the body.
+        eye: Direction to where a solid is looked at from (3,), if there is no view.
+        size: Width and height [pixels]; by default 1600 pixels wide and as high as it takes.
+        length: Unit of lengths.
+        oversampling: Pixels of VTK's images for each one of the picture, along a side.
     """
 
-    field: str = "u"
-    component: int | str | None = None
-    warp: str | None = "u"
-    label: str | None = None
-    unit: str | None = None
-
-
-@dataclass
-class Visible:
-    """What can be seen of a body.
-
-    Attributes:
-        dim: Of the body: 1, 2 or 3.
-        points: Shape (points, 3).
-        faces: Segments, or (surface) triangles, by their points: (faces, 2 or 3).
-        values: By name, at points or, of fields constant on cells, on faces: (…, components).
-        cellwise: Names of those on faces.
-    """
-
-    dim: int
-    points: Array
-    faces: Ints
-    values: dict[str, Array]
-    cellwise: frozenset[str]
+    factors: Mapping[str, float] = field(default_factory=dict)
+    view: View | None = None
+    eye: tuple[float, float, float] | None = None
+    size: tuple[int, int] | None = None
+    length: str = "m"
+    oversampling: float = 2.0
 
 
 def draw(
@@ -76,132 +57,215 @@ def draw(
     Raises:
         OSError: if the file cannot be written.
     """
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
-    with mpl.rc_context(_STYLE):
-        figure = Figure(dpi=DPI, facecolor="white")
-        caption = (_draw_lines if body.dim == 1 else _draw_views)(figure, body, panels)
-        stamp = "" if time is None else f"t = {EngFormatter(unit='s')(time)}"
-        figure.suptitle("      ".join(filter(None, [title, stamp])), fontsize=14)
-        if caption:
-            figure.supxlabel(caption, fontsize=9.5, color="0.3")
-        figure.savefig(path, format="png")
+    stamp = "" if time is None else f"t = {EngFormatter(unit='s')(time)}"
+    Drawing(body, panels, title, stamp).save(path)
 
 
-def _draw_lines(figure: Any, body: Visible, panels: Sequence[Panel]) -> str:
+class Drawing:
+    """A figure of panels; it can be drawn again with other values, in the same layout.
+
+    Args:
+        body: What is seen.
+        panels: What is shown of it.
+        title: Stands above, in front of the time.
+        stamp: The time, in words.
+        frame: How it is framed.
+    """
+
+    def __init__(
+        self,
+        body: Visible,
+        panels: Sequence[Panel],
+        title: str = "",
+        stamp: str = "",
+        frame: Frame | None = None,
+    ) -> None:
+        import matplotlib as mpl
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        frame = frame or Frame()
+        with mpl.rc_context(STYLE):
+            dpi = DPI if frame.size is None else frame.size[0] / WIDTH
+            self._figure = Figure(dpi=dpi, facecolor="white")
+            self._canvas = FigureCanvasAgg(self._figure)
+            kind = _Lines if body.dim == 1 else _Views
+            self._parts: Any = kind(self._figure, body, panels, frame)
+            if frame.size is not None:
+                width, height = frame.size
+                self._figure.set_size_inches(WIDTH, height * WIDTH / width)
+            self._title = title
+            self._head = self._figure.suptitle(self._words(stamp), fontsize=14)
+            if self._parts.caption:
+                self._figure.supxlabel(self._parts.caption, fontsize=9.5, color="0.3")
+
+    def _words(self, stamp: str) -> str:
+        return "      ".join(filter(None, [self._title, stamp]))
+
+    def update(self, body: Visible, stamp: str) -> None:
+        """Show other values of the same body."""
+        self._head.set_text(self._words(stamp))
+        self._parts.update(body)
+
+    def save(self, path: Path) -> None:
+        """Write a PNG file.
+
+        Raises:
+            OSError: if it cannot be written.
+        """
+        self._figure.savefig(path, format="png")
+
+    def pixels(self) -> Any:
+        """Colours from the top, shape (height, width, 3), of type uint8."""
+        canvas: Any = self._canvas
+        canvas.draw()
+        # Layout takes longer than all else, and must not move from frame to frame.
+        self._figure.set_layout_engine("none")
+        return np.asarray(canvas.buffer_rgba())[:, :, :3].copy()
+
+
+class _Lines:
     """Values along a one-dimensional body, one plot below the other."""
-    figure.set_size_inches(WIDTH, 1.0 + 2.6 * len(panels))
-    figure.set_layout_engine("constrained")
-    scale, prefix = _prefix(np.ptp(body.points[:, 0]), "m")
-    # Segments from left to right, each with its left end first.
-    x = body.points[:, 0]
-    order = np.argsort(x[body.faces].mean(axis=1))
-    ends = np.take_along_axis(body.faces[order], np.argsort(x[body.faces[order]], axis=1), axis=1)
-    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    for ax, panel in zip(axes, panels, strict=True):
-        count = body.values[panel.field].shape[1]
-        every = panel.component is None and count > 1
-        for component in range(count) if every else [panel.component]:
-            shown = _Shown(replace(panel, component=component), body, together=every)
-            rows = order.repeat(2) if panel.field in body.cellwise else ends.ravel()
-            ax.plot(x[ends.ravel()] / scale, shown.values[rows], lw=1.8, label=shown.symbol)
-        if every:
-            ax.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.98))
-        ax.set_ylabel(shown.label)
-        ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useMathText=True)
-        ax.grid(color="0.9", lw=0.6)
-        ax.margins(x=0)
-    axes[-1].set_xlabel(f"x [{prefix}m]")
-    return ""
+
+    caption = ""
+
+    def __init__(
+        self, figure: Any, body: Visible, panels: Sequence[Panel], frame: Frame
+    ) -> None:
+        figure.set_size_inches(WIDTH, 1.0 + 2.6 * len(panels))
+        figure.set_layout_engine("constrained")
+        scale, prefix = prefixed(np.ptp(body.points[:, 0]), frame.length)
+        # Segments from left to right, each with its left end first.
+        x = body.points[:, 0]
+        self._order = np.argsort(x[body.faces].mean(axis=1))
+        left = np.argsort(x[body.faces[self._order]], axis=1)
+        self._ends = np.take_along_axis(body.faces[self._order], left, axis=1).ravel()
+        self._curves: list[tuple[Any, Panel, bool]] = []
+        axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+        for ax, panel in zip(axes, panels, strict=True):
+            count = body.values[panel.field].shape[1]
+            every = panel.component is None and count > 1
+            for component in range(count) if every else [panel.component]:
+                one = replace(panel, component=component)
+                shown = Shown(one, body, together=every)
+                [line] = ax.plot(
+                    x[self._ends] / scale, self._along(shown, one, body), lw=1.8,
+                    label=shown.symbol,
+                )  # fmt: skip
+                self._curves.append((line, one, every))
+            if every:
+                ax.legend(frameon=False, ncols=6, loc="lower right", bbox_to_anchor=(1.0, 0.98))
+            if panel.limits is not None:
+                margin = 0.05 * (shown.limits[1] - shown.limits[0])
+                ax.set_ylim(shown.limits[0] - margin, shown.limits[1] + margin)
+            ax.set_ylabel(shown.label)
+            ax.ticklabel_format(axis="y", style="sci", scilimits=(-2, 4), useMathText=True)
+            ax.grid(color="0.9", lw=0.6)
+            ax.margins(x=0)
+        axes[-1].set_xlabel(f"x [{prefix}{frame.length}]" if frame.length else "x")
+
+    def _along(self, shown: Shown, panel: Panel, body: Visible) -> Array:
+        cellwise = panel.field in body.cellwise
+        return shown.values[self._order.repeat(2) if cellwise else self._ends]
+
+    def update(self, body: Visible) -> None:
+        for line, panel, every in self._curves:
+            line.set_ydata(self._along(Shown(panel, body, together=every), panel, body))
 
 
-class _Shown:
-    """What a panel shows: values, label with unit, colour map and limits."""
+class _Views:
+    """Images with colour bars."""
 
-    def __init__(self, panel: Panel, body: Visible, together: bool = False) -> None:
-        given, symbol = body.values[panel.field], _SYMBOLS.get(panel.field, panel.field)
-        norm = panel.component == "norm" or (panel.component is None and given.shape[1] > 1)
-        component = int(panel.component or 0) if not norm else 0
-        values = np.linalg.norm(given, axis=1) if norm else given[:, component]
-        index = f"_{{{component + 1}}}" if given.shape[1] > 1 else ""
-        name = f"|{symbol}|" if norm else symbol + index
-        largest = float(np.nanmax(np.abs(given if together else values), initial=0.0))
-        unit = _UNITS.get(panel.field, "") if panel.unit is None else panel.unit
-        scale, prefix = _prefix(largest, unit)
-        self.values, self.symbol = values / scale, f"${name}$"
-        self.label = panel.label or (f"${symbol}$" if together else self.symbol)
-        self.label += f"  [{prefix}{unit}]" if unit else ""
-        # Components of fields have a sign, even while all are positive: the map must not flip.
-        signed = not norm and (panel.field in _SYMBOLS or values.min(initial=0.0) < 0)
-        top = largest / scale or 1.0
-        self.map, self.limits = ("coolwarm", (-top, top)) if signed else ("viridis", (0.0, top))
+    def __init__(
+        self, figure: Any, body: Visible, panels: Sequence[Panel], frame: Frame
+    ) -> None:
+        names = dict.fromkeys(panel.warp or "" for panel in panels)
+        self._factors = {
+            name: frame.factors[name] if name in frame.factors else factor_of(body, name)
+            for name in names
+        }  # fmt: skip
+        self._panels = panels
+        moved = [self._places(body, panel) for panel in panels]
+        view = frame.view or View.of(
+            np.concatenate([body.points, *moved]), body.dim == 3, frame.eye
+        )
+        self._view = view
+        columns = len(panels) if view.aspect > 0.45 else 1
+        rows = len(panels) // columns
+        width = WIDTH / columns - (1.9 if body.dim == 2 else 1.3)
+        height = min(width * view.aspect, 6.5)
+        self._pixels = round(frame.oversampling * figure.dpi * height)
+        figure.set_size_inches(WIDTH, rows * (height + (0.7 if body.dim == 2 else 0.2)) + 0.8)
+        figure.set_layout_engine("compressed")
+        scale, prefix = prefixed(float(np.ptp(body.points, axis=0).max()), frame.length)
+        unit = f" [{prefix}{frame.length}]" if frame.length else ""
+        axes, self._images = figure.subplots(rows, columns, squeeze=False).ravel(), []
+        for ax, panel, points in zip(axes, panels, moved, strict=True):
+            shown = Shown(panel, body)
+            (left, bottom), (right, top) = view.low / scale, view.high / scale
+            self._images.append(
+                ax.imshow(
+                    self._image(body, shown, points), extent=(left, right, bottom, top),
+                    interpolation="antialiased",
+                )
+            )  # fmt: skip
+            if body.dim == 2:
+                ax.set_xlabel(f"x{unit}")
+                ax.set_ylabel(f"y{unit}")
+            else:
+                ax.set_axis_off()
+            colour_bar(figure, ax.inset_axes((1.03, 0.0, 0.18 / width, 1.0)), shown)
+        if body.dim == 3:
+            axes_cross(axes[-1], view.screen)
+        self.caption = caption(body, self._factors, scale, prefix + frame.length)
+
+    def _places(self, body: Visible, panel: Panel) -> Array:
+        name = panel.warp or ""
+        return body.points + displacement(body, name, self._factors[name])
+
+    def _image(self, body: Visible, shown: Shown, points: Array) -> Any:
+        colours = (shown.map, shown.limits)
+        return image(
+            self._view, self._pixels, body.faces, body.points, points, shown.values, colours
+        )
+
+    def update(self, body: Visible) -> None:
+        for artist, panel in zip(self._images, self._panels, strict=True):
+            artist.set_data(self._image(body, Shown(panel, body), self._places(body, panel)))
 
 
-def _prefix(largest: float, unit: str) -> tuple[float, str]:
-    """Power of 1000 that brings ``largest`` between 0.5 and 500 if ``unit`` takes its prefix."""
-    if unit not in _SCALABLE or not (math.isfinite(largest) and largest > 0):
-        return 1.0, ""
-    power = min(max(3 * math.floor(math.log10(2 * largest) / 3), -12), 9)
-    return 10.0**power, _PREFIXES[power]
-
-
-def _draw_views(figure: Any, body: Visible, panels: Sequence[Panel]) -> str:
-    """Images with colour bars; returns what to say about them all."""
+def colour_bar(figure: Any, ax: Any, shown: Shown) -> None:
+    """The bar of what is shown, in axes of its own."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
-    factors = {name: _factor(body, name) for name in dict.fromkeys(p.warp or "" for p in panels)}
-    moves = [_displacement(body, name, factors[name]) for name in (p.warp or "" for p in panels)]
-    places = [body.points + move for move in moves]
-    view = View.of(np.concatenate([body.points, *places]), solid=body.dim == 3)
-    columns = len(panels) if view.aspect > 0.45 else 1
-    rows = len(panels) // columns
-    width = WIDTH / columns - (1.9 if body.dim == 2 else 1.3)
-    height = min(width * view.aspect, 6.5)
-    figure.set_size_inches(WIDTH, rows * (height + (0.7 if body.dim == 2 else 0.2)) + 0.8)
-    figure.set_layout_engine("compressed")
-    scale, prefix = _prefix(float(np.ptp(body.points, axis=0).max()), "m")
-    axes = figure.subplots(rows, columns, squeeze=False).ravel()
-    for ax, panel, points in zip(axes, panels, places, strict=True):
-        shown = _Shown(panel, body)
-        colours, pixels = (shown.map, shown.limits), round(2 * DPI * height)
-        picture = image(view, pixels, body.faces, body.points, points, shown.values, colours)
-        (left, bottom), (right, top) = view.low / scale, view.high / scale
-        ax.imshow(picture, extent=(left, right, bottom, top), interpolation="antialiased")
-        if body.dim == 2:
-            ax.set_xlabel(f"x [{prefix}m]")
-            ax.set_ylabel(f"y [{prefix}m]")
-        else:
-            ax.set_axis_off()
-        colouring = ScalarMappable(Normalize(*shown.limits), shown.map)
-        bar = figure.colorbar(colouring, cax=ax.inset_axes((1.03, 0.0, 0.18 / width, 1.0)))
-        bar.set_label(shown.label, fontsize=13)
-        bar.outline.set_linewidth(0.6)
-        bar.formatter.set_useMathText(True)
-        bar.formatter.set_powerlimits((-2, 4))
-    if body.dim == 3:
-        _axes_cross(axes[0], view.screen)
-    return _caption(body, factors, scale, prefix)
+    colouring = ScalarMappable(Normalize(*shown.limits), shown.map)
+    bar = figure.colorbar(colouring, cax=ax, extend=shown.extend)
+    bar.set_label(shown.label, fontsize=13)
+    bar.outline.set_linewidth(0.6)
+    bar.formatter.set_useMathText(True)
+    bar.formatter.set_powerlimits((-2, 4))
 
 
-def _caption(body: Visible, factors: dict[str, float], scale: float, prefix: str) -> str:
+def caption(body: Visible, factors: Mapping[str, float], scale: float, unit: str) -> str:
+    """The size of a solid, and how displacements are drawn."""
     told = []
     if body.dim == 3:
         sizes = " × ".join(f"{size:.3g}" for size in np.ptp(body.points, axis=0) / scale)
-        told.append(f"body of {sizes} {prefix}m")
+        told.append(f"body of {sizes} {unit}".rstrip())
     for name, factor in factors.items():
         if factor > 0:
             times = f"{factor:g}" if factor < 1e5 else f"{factor:.0e}".replace("e+0", "e+")
             drawn = "to scale" if factor == 1 else f"{times} times as large"
-            told.append(f"${_SYMBOLS.get(name, name)}$ drawn {drawn}, edges at rest in grey")
+            told.append(f"${SYMBOLS.get(name, name)}$ drawn {drawn}, edges at rest in grey")
     return "      ".join(told)
 
 
-def _factor(body: Visible, name: str) -> float:
+def factor_of(body: Visible, name: str) -> float:
     """1, 2 or 5 times a power of ten that makes displacements visible; 0 if there are none."""
-    values = np.linalg.norm(_displacement(body, name, 1.0), axis=1)
+    values = np.linalg.norm(displacement(body, name, 1.0), axis=1)
     largest = float(values.max(initial=0.0))
     # What remains of a motion out of the picture's plane may be round-off.
     if largest == 0 or largest < 1e-9 * np.nanmax(np.abs(body.values[name])):
@@ -213,7 +277,7 @@ def _factor(body: Visible, name: str) -> float:
     return power * max(digit for digit in (1, 2, 5) if digit <= wanted / power * (1 + 1e-9))
 
 
-def _displacement(body: Visible, name: str, factor: float) -> Array:
+def displacement(body: Visible, name: str, factor: float) -> Array:
     """Shape (points, 3); components that leave the plane of a flat body are left out."""
     moves = np.zeros_like(body.points)
     if factor and name in body.values and body.values[name].shape[1] >= body.dim:
@@ -221,9 +285,11 @@ def _displacement(body: Visible, name: str, factor: float) -> Array:
     return moves
 
 
-def _axes_cross(ax: Any, screen: Array) -> None:
+def axes_cross(ax: Any, screen: Array) -> None:
     """Arrows along x, y and z in the lower left corner."""
     for name, arrow in zip("xyz", screen.T, strict=True):
+        if np.linalg.norm(arrow) < 0.1:  # straight towards the eye
+            continue
         ax.annotate(
             name,
             xy=(24, 24),

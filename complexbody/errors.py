@@ -50,6 +50,10 @@ class CheckpointError(ComplexBodyError):
     exit_code = 6
 
 
+class ResultsError(ComplexBodyError, ValueError):
+    """A folder does not have the results that are asked for, or they cannot be read."""
+
+
 class CommandError(ComplexBodyError):
     """The command line or a scene file is wrong."""
 

@@ -16,10 +16,11 @@ import numpy as np
 
 from complexbody import _compat
 from complexbody._compat import Ints
-from complexbody.drawing import Panel, Visible, draw
+from complexbody.drawing import draw
 from complexbody.errors import MissingPackage, OutputError
 from complexbody.files import on_first_rank
 from complexbody.rendering import require_vtk
+from complexbody.scales import Panel, Visible
 
 __all__ = ["Panel", "still"]
 
@@ -48,7 +49,7 @@ def still(
     _check(panels, functions)
     domain = next(iter(functions.values())).function_space.mesh
     file, dim = Path(path), domain.topology.dim
-    on_first_rank(domain.comm, file, lambda: _require_tools(dim))
+    on_first_rank(domain.comm, file, lambda: require_tools(dim))
     used = {name for panel in panels for name in (panel.field, panel.warp)}
     body = _visible(domain, {name: functions[name] for name in functions if name in used})
 
@@ -82,7 +83,12 @@ def _check(panels: Sequence[Panel], functions: Mapping[str, Any]) -> None:
             )
 
 
-def _require_tools(dim: int) -> None:
+def require_tools(dim: int) -> None:
+    """See that bodies of ``dim`` dimensions can be drawn.
+
+    Raises:
+        MissingPackage: if something is missing.
+    """
     if find_spec("matplotlib") is None:
         raise MissingPackage("Picture: there is no matplotlib. Run: pip install matplotlib")
     if dim > 1:

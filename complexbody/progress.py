@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 
@@ -35,3 +36,18 @@ class Progress:
         """Leave the line: what follows starts on a new one."""
         if self._bar is not None:
             self._bar.close()
+
+
+def counted(items: Sequence[Any], name: str, wanted: bool | None) -> Any:
+    """The items, one by one, with a line that counts them; for one process.
+
+    Args:
+        items: What is gone through.
+        name: What to call them.
+        wanted: True or False; None shows it where standard error is a terminal.
+    """
+    if not (sys.stderr.isatty() if wanted is None else wanted):
+        return items
+    from tqdm import tqdm
+
+    return tqdm(items, desc=name, mininterval=0.5, leave=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
@@ -63,10 +64,19 @@ class View:
     high: Array
 
     @classmethod
-    def of(cls, points: Array, solid: bool) -> View:
-        """A frame around points (points, 3), from above or, of a solid, aslant from the front."""
+    def of(cls, points: Array, solid: bool, eye: Sequence[float] | None = None) -> View:
+        """A frame around points (points, 3).
+
+        Args:
+            points: All that is to be seen.
+            solid: Looked at aslant from the front, else from above.
+            eye: Direction to where a solid is looked at from, instead (3,).
+        """
         towards = _ASLANT if solid else np.array([0.0, 0.0, 1.0])
-        right = np.cross([0.0, 0.0, 1.0] if solid else [0.0, 1.0, 0.0], towards)
+        if solid and eye is not None:
+            towards = np.asarray(eye, dtype=float) / np.linalg.norm(eye)
+        above = abs(towards[2]) > 1 - 1e-9
+        right = np.cross([0.0, 1.0, 0.0] if above else [0.0, 0.0, 1.0], towards)
         right /= np.linalg.norm(right)
         screen = np.array([right, np.cross(towards, right)])
         seen = points @ screen.T
@@ -77,6 +87,12 @@ class View:
     def towards(self) -> Array:
         """Unit vector to where it is looked at from."""
         return np.cross(*self.screen)
+
+    def and_also(self, other: View) -> View:
+        """A frame around what is in this one and in another from the same direction."""
+        return View(
+            self.screen, np.minimum(self.low, other.low), np.maximum(self.high, other.high)
+        )
 
     @property
     def aspect(self) -> float:
@@ -148,7 +164,7 @@ def image(
     edges = still.extract_feature_edges(
         feature_angle=35,
         boundary_edges=True,
-        feature_edges=solid,
+        feature_edges=bool(np.ptp(rest[:, 2]) > 0),  # faces of flat bodies look either way
         manifold_edges=False,
         non_manifold_edges=False,
     )

@@ -11,9 +11,10 @@ from scipy.spatial import cKDTree
 from written import domain
 
 from complexbody import _compat, picture, rendering
-from complexbody.drawing import Visible, _displacement, _factor, _prefix, _Shown
+from complexbody.drawing import displacement, factor_of
 from complexbody.errors import MissingPackage, OutputError
 from complexbody.picture import Panel, still
+from complexbody.scales import Shown, Visible, prefixed
 
 mpl = pytest.importorskip("matplotlib")
 pytest.importorskip("pyvista")
@@ -146,30 +147,30 @@ def body(dim, u):
 def test_deformation_is_visible_and_round():
     """6 % of the body, rounded down to 1, 2 or 5; to scale if that is near; none without motion."""
     for largest, factor in ((1e-6, 5e5), (2e-3, 200), (0.4, 1), (2.0, 1), (100.0, 0.005)):
-        assert _factor(body(2, [largest, 0.0, 0.0]), "u") == pytest.approx(factor)
-    assert _factor(body(2, [0.0, 0.0, 0.0]), "u") == 0
+        assert factor_of(body(2, [largest, 0.0, 0.0]), "u") == pytest.approx(factor)
+    assert factor_of(body(2, [0.0, 0.0, 0.0]), "u") == 0
     # Antiplane motion: in the plane there is round-off.
-    assert _factor(body(2, [1e-12, 0.0, 1.0]), "u") == 0
-    assert not _displacement(body(2, [1.0]), "u", 1.0).any()
-    np.testing.assert_array_equal(_displacement(body(2, [1.0, 2.0, 3.0]), "u", 2.0)[0], [2, 4, 0])
+    assert factor_of(body(2, [1e-12, 0.0, 1.0]), "u") == 0
+    assert not displacement(body(2, [1.0]), "u", 1.0).any()
+    np.testing.assert_array_equal(displacement(body(2, [1.0, 2.0, 3.0]), "u", 2.0)[0], [2, 4, 0])
 
 
 def test_units_and_maps():
     """Prefixes bring numbers near 1 where a unit takes them; only signed fields have a middle."""
-    assert _prefix(0.9e-6, "m") == (pytest.approx(1e-6), "µ")
-    assert _prefix(0.02, "m/s") == (pytest.approx(1e-3), "m")
-    assert _prefix(7e7, "Pa") == (pytest.approx(1e6), "M")
-    assert _prefix(1e-30, "m")[1] == "p"
+    assert prefixed(0.9e-6, "m") == (pytest.approx(1e-6), "µ")
+    assert prefixed(0.02, "m/s") == (pytest.approx(1e-3), "m")
+    assert prefixed(7e7, "Pa") == (pytest.approx(1e6), "M")
+    assert prefixed(1e-30, "m")[1] == "p"
     for largest, unit in ((7e7, ""), (7e7, "m²"), (0.0, "m"), (np.inf, "m")):
-        assert _prefix(largest, unit) == (1.0, "")
+        assert prefixed(largest, unit) == (1.0, "")
     seen = body(2, [3e-6, -4e-6])
-    norm = _Shown(Panel("u"), seen)
+    norm = Shown(Panel("u"), seen)
     assert (norm.label, norm.map) == ("$|u|$  [µm]", "viridis")
     assert norm.limits == pytest.approx((0, 5)) and norm.values == pytest.approx(5)
-    second = _Shown(Panel("u", 1, unit=""), seen)
+    second = Shown(Panel("u", 1, unit=""), seen)
     assert (second.label, second.map) == ("$u_{2}$", "coolwarm")
     assert second.limits == pytest.approx((-4e-6, 4e-6))
-    assert _Shown(Panel("u", 0, label="opening"), seen).label == "opening  [µm]"
+    assert Shown(Panel("u", 0, label="opening"), seen).label == "opening  [µm]"
 
 
 @pytest.mark.parametrize(
