@@ -176,7 +176,8 @@ def find(
         why = comm.bcast(why)
         about = comm.bcast(None if found is None else found.about)
         if about is not None:
-            why = _foreign(path, about, problem, method, known)
+            # One word for all: round-off need not be the same on all ranks.
+            why = comm.bcast(_foreign(path, about, problem, method, known))
         if not why:
             if refused and comm.rank == 0:
                 told = f"{' '.join(refused)} {path.name} is used instead."

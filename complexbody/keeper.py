@@ -81,12 +81,8 @@ class Keeper:
         self._good: tuple[Snapshot, Description] | None = None
         self._signal = 0
 
-        def prepare() -> None:
-            folder.mkdir(parents=True, exist_ok=True)
-            for path in list(folder.glob("step-*.npz*" if fresh else "step-*.part")):
-                path.unlink()
-
-        on_first_rank(self.comm, folder, prepare)
+        on_first_rank(self.comm, folder, lambda: folder.mkdir(parents=True, exist_ok=True))
+        clear(self.comm, folder, "step-*.npz*" if fresh else "step-*.part")
 
     # --- when ------------------------------------------------------------------------------------
 
@@ -248,6 +244,20 @@ class Keeper:
             yield f"{kind}/{name}", np.zeros(0) if table is None else table
         for name, make in more.items():
             yield name, make()
+
+
+def clear(comm: Any, folder: Path, pattern: str = "step-*.npz*") -> None:
+    """Remove what an earlier run has left in a folder of checkpoints; collective.
+
+    Raises:
+        OutputError: if that is refused.
+    """
+
+    def remove() -> None:
+        for path in list(folder.glob(pattern)):
+            path.unlink()
+
+    on_first_rank(comm, folder, remove)
 
 
 def require_snapshots(run: Any) -> None:

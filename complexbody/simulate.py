@@ -18,7 +18,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import machine, planning
-from complexbody.checkpoint import Checkpoint, Found, described, find
+from complexbody.checkpoint import FOLDER, Checkpoint, Found, described, find
 from complexbody.errors import AccuracyError, DivergenceError, SceneError, SolverError
 from complexbody.files import CsvWriter
 from complexbody.identity import identity
@@ -29,7 +29,7 @@ from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
-from complexbody.keeper import Description, Keeper
+from complexbody.keeper import Description, Keeper, clear
 from complexbody.ledger import Bookkeeper
 from complexbody.numbering import Numbering
 from complexbody.output import Output, Writer
@@ -191,6 +191,8 @@ class Simulation:
                 self.problem, self.run_, checkpoint, folder, self._about(known), self._describe,
                 self._settle, fresh=found is None,
             )  # fmt: skip
+        elif output is not None and found is None:
+            clear(self.comm, Path(output.folder) / FOLDER)  # they belong to what is replaced
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
         written = None if found is None else float(found.about["written"])
         self.writer = (
