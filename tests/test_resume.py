@@ -143,9 +143,9 @@ def test_the_last_good_state_of_a_run_that_diverges(comm, shared_path):
     newest = statefile.listed(shared_path / "checkpoints")[0]
     about, arrays = statefile.read(newest)
     assert all(np.isfinite(arrays[name]).all() for name in arrays)
-    assert about["time"] == arrays["ledger"][-1, 0]  # the row before the one that stopped the run
+    assert about["time"] == arrays["ledger"][-1, 0]  # a row before the one that stopped the run
     rows = np.loadtxt(shared_path / "ledger.csv", delimiter=",", skiprows=1)
-    assert rows[-2, 0] == about["time"] < rows[-1, 0]
+    assert about["time"] in rows[:-1, 0]
     with pytest.raises(DivergenceError):
         simulated(scene, method, 15.0, shared_path, checkpoint=STEPS, resume=True)
 
