@@ -15,7 +15,7 @@ the largest energy.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -126,6 +126,16 @@ class Bookkeeper:
         self.ledger.rows.append([float(v) for v in row])
         self._guard(e.surplus - self._start if run.steps > 0 else 0.0)
         return self.ledger.rows[-1]
+
+    def state(self) -> dict[str, float | None]:
+        """What later rows depend on besides the run."""
+        return {name: getattr(self, f"_{name}") for name in ("start", "put", "reference", "size")}
+
+    def restore(self, state: Mapping[str, float | None], rows: Array) -> None:
+        """Go on from a state and the rows so far (rows, columns)."""
+        for name, value in state.items():
+            setattr(self, f"_{name}", value)
+        self.ledger.rows[:] = rows.tolist()
 
     def _guard(self, excess: float) -> None:
         run, problem = self.run, self.problem

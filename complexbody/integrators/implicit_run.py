@@ -18,6 +18,7 @@ from complexbody.integrators.entries import Entries, energies
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.global_newton import GlobalNewton
 from complexbody.integrators.nodal_newton import NodalNewton
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -179,6 +180,29 @@ class ImplicitRun(ForceRun):
             f"Use a smaller step than {self.step:.3g} s, or check the inertia there: the last "
             "state is kept."
         )
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two steps; arrays are views, valid until a step; collective."""
+        saved, n = super().snapshot(), self.problem.disc.n
+        saved.nodes |= {"previous": self.previous[:-1, :n], "momentum": self.momentum}
+        saved.sums["newton"] = self.count[:1]
+        saved.numbers |= {"most": max(self.problem.comm.allgather(int(self.count[1])))}
+        saved.numbers |= {"solved": int(self.count[2]), "linear": self.linear, **vars(self.range)}
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.previous[:-1, : self.problem.disc.n] = saved.nodes["previous"]
+        self.momentum[:] = saved.nodes["momentum"]
+        newton, numbers = saved.sums["newton"][0], saved.numbers
+        self.count[:] = newton, numbers["most"], numbers["solved"]
+        self.linear = int(numbers["linear"])
+        for name in vars(self.range):
+            setattr(self.range, name, numbers[name])
+        super()._refresh(saved)
+        if isinstance(self.solver, NodalNewton) and self.steps > 0:
+            self.solver.follow()
 
     # --- what a user sees at t_n ---------------------------------------------------------------
 
