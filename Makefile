@@ -18,7 +18,7 @@ MPI_PYTEST := $(PYTEST) --color=no -p no:cacheprovider -o faulthandler_timeout=2
 # nproc obeys OMP_NUM_THREADS, which is 1 here.
 RANKS := $(shell n=$$(env -u OMP_NUM_THREADS nproc); echo $$((n < 2 ? n : 2)))
 
-.PHONY: help setup demo charts test verify test-debian13 lint clean
+.PHONY: help setup demo charts test verify test-debian13 docs lint clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -76,6 +76,12 @@ verify: setup ## every test, slow ones too: serially, on 2 and on 3 ranks
 
 test-debian13: ## make test in a Debian 13 root (as root; ARGS="..." runs that instead)
 	@tools/test-debian13.sh $(if $(ARGS),"$(ARGS)")
+
+docs: setup ## the documentation as HTML (build/docs), links and docstrings checked
+	@test -x .venv/bin/sphinx-build || \
+	    $(PYTHON) -m pip install -q -c .venv/constraints.txt -e '.[docs]'
+	.venv/bin/sphinx-build -W --keep-going -q -b html docs build/docs
+	@echo build/docs/index.html
 
 lint: setup ## ruff and mypy
 	@test -x .venv/bin/mypy -a -x .venv/bin/ruff || \

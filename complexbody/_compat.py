@@ -6,17 +6,22 @@ Everything is probed with ``hasattr``; no other file may ask for a version.
 
 from __future__ import annotations
 
+import ctypes
 import inspect
 import itertools
 import logging
+import os
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import cpp, fem, geometry, io, jit, la, mesh, plot
+
+from complexbody import jitcache, native
 
 # dolfinx 0.5's JIT logs every compilation at level INFO through the root logger.
 for _handler in logging.getLogger().handlers:
@@ -25,11 +30,48 @@ for _handler in logging.getLogger().handlers:
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
 
+
+def steady_partitions() -> None:
+    """Let Scotch cut a mesh as it did in the last process that made the same meshes.
+
+    It draws random numbers from the clock, and its threads race: each run would have other parts,
+    and other last bits. Does nothing where dolfinx has no Scotch.
+    """
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
+    try:
+        with open("/proc/self/maps") as maps:
+            loaded = {line.split()[-1] for line in maps if "/libscotch-" in line}
+    except OSError:
+        return
+    for path in loaded:
+        library = ctypes.CDLL(path)
+        if hasattr(library, "SCOTCH_randomSeed") and hasattr(library, "SCOTCH_randomReset"):
+            library.SCOTCH_randomSeed(ctypes.c_int64(1))
+            library.SCOTCH_randomReset()
+
+
+steady_partitions()
+
 #: Options for every FFCx compilation: the flags matter more than who loops (measured).
 JIT_OPTIONS: dict[str, Any] = {
     "cffi_extra_compile_args": ["-O3", "-march=native", "-fno-math-errno"],
     "timeout": 120,
 }
+
+
+def _patient() -> None:
+    """Give dolfinx's own compiles (of elements) time, a place, and no leftovers of killed ones."""
+    for name in ("DOLFINX_DEFAULT_JIT_OPTIONS", "DOLFINX_DEFAULT_JIT_PARAMETERS"):
+        defaults = getattr(jit, name, None)
+        if defaults is not None and "timeout" in defaults:
+            known = Path(str(defaults["cache_dir"][0])).expanduser()
+            place = native.writable(known.parent, known.name)
+            defaults["cache_dir"] = (place, defaults["cache_dir"][1])
+            defaults["timeout"] = (JIT_OPTIONS["timeout"], defaults["timeout"][1])
+            jitcache.wait_and_heal(place)
+
+
+_patient()
 
 
 def equispaced(domain: mesh.Mesh) -> None:
@@ -139,20 +181,27 @@ def geometry_degree(domain: mesh.Mesh) -> int:
 
 
 def form(expression: Any) -> Any:
-    """Compile a UFL form (or a list of them) with the project's JIT options."""
-    if hasattr(jit, "ffcx_jit") and "jit_options" in fem.form.__code__.co_varnames:
-        return fem.form(expression, jit_options=JIT_OPTIONS)
-    return fem.form(expression, jit_params=JIT_OPTIONS)
+    """Compile a UFL form with the project's JIT options."""
+    new = hasattr(jit, "ffcx_jit") and "jit_options" in fem.form.__code__.co_varnames
+    name = "jit_options" if new else "jit_params"
+
+    def make(cache: str) -> Any:
+        return fem.form(expression, **{name: {**JIT_OPTIONS, "cache_dir": cache}})
+
+    return jitcache.compiled(expression.ufl_domains()[0].ufl_cargo().comm, make)
 
 
 def expression(value: Any, space: fem.FunctionSpace) -> fem.Expression:
     """A compiled UFL expression at the interpolation points of ``space``."""
     points = space.element.interpolation_points
     points = points() if callable(points) else points
-    try:
-        return fem.Expression(value, points, jit_options=JIT_OPTIONS)
-    except TypeError:
-        return fem.Expression(value, points, jit_params=JIT_OPTIONS)
+    new = "jit_options" in inspect.signature(fem.Expression.__init__).parameters
+    name = "jit_options" if new else "jit_params"
+
+    def make(cache: str) -> Any:
+        return fem.Expression(value, points, **{name: {**JIT_OPTIONS, "cache_dir": cache}})
+
+    return jitcache.compiled(space.mesh.comm, make)
 
 
 def evaluate(compiled: fem.Expression, domain: mesh.Mesh, cells: Ints) -> Array:
@@ -189,6 +238,15 @@ def coefficient_positions(compiled: Any) -> list[int]:
 def petsc_vector(function: fem.Function) -> Any:
     """The PETSc Vec that shares the function's storage."""
     return function.x.petsc_vec if hasattr(function.x, "petsc_vec") else function.vector
+
+
+def free_vector(function: fem.Function) -> None:
+    """Destroy the Vec of :func:`petsc_vector`, if there is one: dolfinx 0.5 never does."""
+    for holder in (function, function.x):
+        vector = getattr(holder, "_petsc_x", None)
+        if vector is not None:
+            vector.destroy()
+            holder._petsc_x = None
 
 
 def mesh_from_gmsh(model: Any, comm: Any, rank: int = 0, gdim: int = 3) -> tuple[Any, Any, Any]:
@@ -267,8 +325,8 @@ def facet_nodes(domain: mesh.Mesh, facets: Ints) -> Ints:
     to_cell = domain.topology.connectivity(tdim - 1, tdim)
     to_facet = domain.topology.connectivity(tdim, tdim - 1).array.reshape(-1, tdim + 1)
     cells = to_cell.array[to_cell.offsets[facets]]
-    # Facet i of a simplex lies opposite to its vertex i.
-    beside = to_facet[cells] != np.asarray(facets)[:, None]
+    # Facet i of a simplex lies opposite to its vertex i, but that of an interval is vertex i.
+    beside = (to_facet[cells] != np.asarray(facets)[:, None]) ^ (tdim == 1)
     return cell_nodes(domain)[cells][beside].reshape(-1, tdim)
 
 
@@ -320,10 +378,18 @@ def accumulate(function: fem.Function) -> None:
 
 def expression_kernel(value: Any, points: Array, comm: Any) -> tuple[Any, Any]:
     """A UFL expression compiled at reference points: what keeps it alive, and its C function."""
-    options = {"form_compiler_options": {"scalar_type": np.float64}, "jit_options": JIT_OPTIONS}
-    if "form_compiler_params" in inspect.signature(jit.ffcx_jit).parameters:  # up to 0.5
-        options = {"form_compiler_params": {"scalar_type": "double"}, "jit_params": JIT_OPTIONS}
-    made = jit.ffcx_jit(comm, (value, points), **options)
+    old = "form_compiler_params" in inspect.signature(jit.ffcx_jit).parameters  # up to 0.5
+    compiler: tuple[str, str] = "form_compiler_options", "jit_options"
+    own: Any = np.float64
+    if old:
+        compiler, own = ("form_compiler_params", "jit_params"), "double"
+
+    def make(cache: str) -> Any:
+        options = {compiler[0]: {"scalar_type": own},
+                   compiler[1]: {**JIT_OPTIONS, "cache_dir": cache}}  # fmt: skip
+        return jit.ffcx_jit(comm, (value, points), **options)
+
+    made = jitcache.compiled(comm, make)
     return made, made[0].tabulate_tensor_float64
 
 

@@ -31,6 +31,7 @@ from mpi4py import MPI
 from complexbody.asked import Accuracy, Parting
 from complexbody.candidates import candidates, halved, name_of, scaled
 from complexbody.errors import AccuracyError
+from complexbody.given import is_positive, short
 from complexbody.histories import Constant
 from complexbody.integrators.entries import Run
 from complexbody.pilots import Moment, Piece, Pilots, attempt, moment_of
@@ -38,7 +39,7 @@ from complexbody.precheck import limits
 from complexbody.problem import Problem
 from complexbody.result import Result
 from complexbody.scene import Scene
-from complexbody.simulate import Simulation, require_until
+from complexbody.simulate import Simulation, check_options
 
 Array = npt.NDArray[np.float64]
 
@@ -96,11 +97,11 @@ class Accurate:
                 "simulate: accuracy= chooses the integrator, and integrator= is given as well. "
                 "Give one of them."
             )
-        if not (np.isfinite(asked) and 0 < asked < 1):
+        if not (is_positive(asked) and asked < 1):
             raise AccuracyError(
-                f"simulate: accuracy is {asked}. Give a relative error between 0 and 1."
+                f"simulate: accuracy is {short(asked)}. Give a relative error between 0 and 1."
             )
-        require_until(until)
+        check_options(until=until, **options)
         self.scene, self.asked, self.until, self.options = scene, asked, until, options
         begun = clock.process_time()
         self.pilots = Pilots(scene, options.get("plan", True))

@@ -21,7 +21,8 @@ from dolfinx import fem
 from complexbody import _compat
 from complexbody.body import Body
 from complexbody.densities import scalar
-from complexbody.errors import SceneError
+from complexbody.errors import BodyError, SceneError, agree
+from complexbody.given import is_finite, short
 from complexbody.scene import BodyForce, Pressure, Scene, Traction
 
 
@@ -72,6 +73,21 @@ class Action:
             return None
         u, nu, _, _ = self.fields(q)
         return scalar(f"potential of {body.name}", body.potential, u, nu)
+
+    def check_densities(self) -> None:
+        """Evaluate all densities once, before anything relies on them; collective.
+
+        Raises:
+            BodyError: if one fails on any rank (on all ranks).
+        """
+        error: Exception | None = None
+        try:
+            for body in self.scene.bodies:
+                self.stored_density(body, self.q)
+                self.potential_density(body, self.q)
+        except BodyError as found:
+            error = found
+        agree(self.scene.mesh.comm, error)
 
     def measure(self, number: int) -> Any:
         """The volume measure on region ``number``: one body may fill several regions."""
@@ -142,9 +158,11 @@ class Action:
         v = ufl.as_vector([self.v[int(i)] for i in rows])
         if isinstance(load, Pressure):
             normal, dim = ufl.FacetNormal(scene.mesh), scene.mesh.geometry.dim
+            if not is_finite(load.pressure):
+                raise SceneError(
+                    f"Pressure: pressure is {short(load.pressure)}. Give a finite number in Pa."
+                )
             p = float(load.pressure)
-            if not np.isfinite(p):
-                raise SceneError(f"Pressure: pressure is {p}. Give a finite number in Pa.")
             # A Constant, so that the form compiles once for all values.
             pressure = fem.Constant(scene.mesh, p)
             vector = ufl.as_vector(

@@ -15,9 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody.errors import BodyError
+from complexbody.given import is_finite, is_number, is_whole, numbers, short
+from complexbody.rotations import RotationAction
 
 Number = float | int
 Matrix = npt.NDArray[np.float64]
+
+#: More components, or points of quadrature, are a mistake: kernels would take for ever to compile.
+MOST_COMPONENTS, MOST_DEGREE = 1000, 40
 
 
 @dataclass(frozen=True)
@@ -48,6 +53,12 @@ class Body:
             one UFL estimates.
         name: What to call it in tables and messages.
         constants: The constants it was made of, by name, for tables and result files.
+        rotation: How ν turns with the body (:mod:`complexbody.rotations`): then runs book angular
+            momentum, and ``cb.objectivity`` checks the energy.
+        parity: How ν goes under a mirror, if a :class:`complexbody.Symmetry` is to know: "polar",
+            "axial", "even", "odd", "tensor", or None.
+        orientation: Stop a run in which a cell turns inside out, det(I + ∇u) ≤ 0; asked only of
+            energies that are not quadratic in U. False for those that mean something there.
 
     Raises:
         BodyError: for shapes, signs or values that no body can have.
@@ -63,13 +74,16 @@ class Body:
     quadrature_degree: int | None = None
     name: str = "body"
     constants: Mapping[str, float] = field(default_factory=dict)
+    rotation: RotationAction | None = None
+    parity: str | None = None
+    orientation: bool = True
 
     def __post_init__(self) -> None:
         for name in ("descriptor", "displacement"):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+            if not (is_whole(value) and 1 <= value <= MOST_COMPONENTS):
                 raise BodyError(
-                    f"Body: {name} is {value!r}, not a whole number of components. "
+                    f"Body: {name} is {short(value)}, not a whole number of components. "
                     f"Give {name}=1 or more."
                 )
         if not callable(self.energy):
@@ -82,15 +96,22 @@ class Body:
                 "Body: potential is not a function. Give potential=f(u, nu) returning a scalar UFL "
                 "expression in J/m³, or None."
             )
-        if not (_is_number(self.density) or hasattr(self.density, "function_space")):
+        if self.rotation is not None and self.rotation.components != self.descriptor:
             raise BodyError(
-                f"Body: density is {self.density!r}, neither a number nor a DG0 Function. Give "
-                "ρ > 0 in kg/m³."
+                f"Body: rotation {self.rotation.name!r} acts on {self.rotation.components} "
+                f"components, but the descriptor has {self.descriptor}. Give one that fits."
             )
-        if _is_number(self.density) and not (np.isfinite(self.density) and self.density > 0):
+        if not (is_number(self.density) or hasattr(self.density, "function_space")):
             raise BodyError(
-                f"Body: density is {self.density}, but mass must be positive. Give ρ > 0 in kg/m³."
+                f"Body: density is {short(self.density)}, neither a number nor a DG0 Function. "
+                "Give ρ > 0 in kg/m³."
             )
+        if is_number(self.density) and not (is_finite(self.density) and self.density > 0):
+            raise BodyError(
+                f"Body: density is {short(self.density)}, but mass must be positive. Give ρ > 0 in "
+                "kg/m³."
+            )
+        self._check_manners()
         if not callable(self.inertia):
             _check_psd("inertia", self.inertia_matrix, self.inertia)
         _check_psd("viscosity", self.viscosity_matrix, self.viscosity)
@@ -101,6 +122,21 @@ class Body:
                     "Body: a component of the descriptor has neither inertia nor viscosity, so "
                     "nothing determines its rate. Give inertia > 0 or viscosity > 0 for it."
                 )
+
+    def _check_manners(self) -> None:
+        """What no equation sees."""
+        degree = self.quadrature_degree
+        if degree is not None and not (is_whole(degree) and 0 <= degree <= MOST_DEGREE):
+            raise BodyError(
+                f"Body: quadrature_degree is {short(degree)}. Give None or a whole number from 0 "
+                f"to {MOST_DEGREE}."
+            )
+        for name, kind, what in (
+            ("name", str, "a text"), ("constants", Mapping, "a dict"),
+            ("orientation", bool, "True or False"),
+        ):  # fmt: skip
+            if not isinstance(getattr(self, name), kind):
+                raise BodyError(f"Body: {name} is {short(getattr(self, name))}. Give {what}.")
 
     @property
     def components(self) -> int:
@@ -161,7 +197,7 @@ class Body:
         Returns:
             ω [rad/s], shape (…, b) for q of shape (…, m), b = 2(n_u + k) less one for each
             direction of ν without inertia, by real part. With ``polarisations`` also a, shape
-            (…, n_u + k, b): |a| = 1 in the fields' own units, the largest component positive.
+            (…, n_u + k, b): of length 1 in the fields' own units, the largest component positive.
 
         Raises:
             BodyError: for a q or a state that makes no sense, coefficients that vary in space, a
@@ -194,12 +230,12 @@ class Body:
 
     def _square(self, name: str, value: Any) -> Matrix:
         k = int(self.descriptor)
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        # Texts, truth values and complex numbers would be converted without a word.
+        array = numbers(value)
+        if array is None:
             raise BodyError(
-                f"Body: {name} is {value!r}. Give a number or a {k}×{k} matrix of numbers."
-            ) from None
+                f"Body: {name} is {short(value)}. Give a number or a {k}×{k} matrix of numbers."
+            )
         if array.ndim == 0:
             return np.diag(np.full(k, float(array)))
         if array.shape != (k, k):
@@ -210,25 +246,25 @@ class Body:
         return array
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating)
-
-
 def _scaled(matrix: Matrix) -> Matrix:
-    """The matrix with unit diagonal where the diagonal is positive, so that units do not matter."""
-    d = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    """The matrix with ±1 or 0 on its diagonal, so that units do not matter."""
+    d = np.sqrt(np.abs(np.diag(matrix)))
     d = np.where(d > 0, d, 1.0)
-    return matrix / np.outer(d, d)
+    return matrix / d / d[:, None]
 
 
 def _check_psd(name: str, matrix: Matrix, given: Any) -> None:
     if not np.all(np.isfinite(matrix)):
-        raise BodyError(f"Body: {name} is {given!r}, which is not finite. Give finite numbers.")
+        raise BodyError(
+            f"Body: {name} is {short(given)}, which is not finite. Give finite numbers."
+        )
     scale = np.abs(matrix).max(initial=0.0)
     if np.abs(matrix - matrix.T).max(initial=0.0) > 1e-12 * scale:
         raise BodyError(
             f"Body: the {name} matrix is not symmetric. Give its symmetric part: the rest "
             "contributes neither to the kinetic energy nor to the dissipation."
         )
-    if np.linalg.eigvalsh(_scaled(0.5 * (matrix + matrix.T))).min(initial=0.0) < -1e-12:
-        raise BodyError(f"Body: {name} is negative ({given!r}). Give {name} ≥ 0.")
+    part = 0.5 * matrix + 0.5 * matrix.T
+    alone = np.diag(part) == 0  # a row of a semidefinite matrix whose diagonal is zero is zero
+    if np.any(part[alone]) or np.linalg.eigvalsh(_scaled(part)).min(initial=0.0) < -1e-12:
+        raise BodyError(f"Body: {name} is negative ({short(given)}). Give {name} ≥ 0.")

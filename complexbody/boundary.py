@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Supports, loads and initial data as nodal arrays of a scene.
+"""Supports and initial data as nodal arrays of a scene: where, and what.
 
-Here predicates and tags become nodes, prescribed values become targets, and loads become vectors
-assembled once, each with a history. Knows no time step.
+Here predicates and tags become nodes or facets, and prescribed values targets. Loads stand in
+:mod:`complexbody.loading`. Knows no time step.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,16 +17,21 @@ from dolfinx import mesh as dmesh
 
 from complexbody import _compat
 from complexbody.action import Action
+from complexbody.amplitudes import Amplitudes, try_histories
+from complexbody.conditions import Symmetry
 from complexbody.errors import SceneError, agree
+from complexbody.given import numbers
 from complexbody.histories import Constant, History
-from complexbody.scene import FIELDS, BodyForce, Fix, Scene
+from complexbody.mirrors import fixed_components, mirror_plane
+from complexbody.predicates import mask as _mask
+from complexbody.scene import FIELDS, Fix, Scene
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[Any]  # int32 from dolfinx, int64 from numpy
 
 
 @dataclass
-class Supports:
+class Supports(Amplitudes):
     """Prescribed components of this rank's geometry nodes.
 
     Attributes:
@@ -34,12 +39,14 @@ class Supports:
         value: Prescribed value at factor 1, same shape.
         history: Index into ``histories`` per entry, same shape (0 where not prescribed).
         histories: The histories; index 0 is constant.
+        mirrors: Planes of symmetry among them, and the axis that each is perpendicular to.
     """
 
     fixed: npt.NDArray[np.bool_]
     value: Array
     history: npt.NDArray[np.int32]
     histories: list[History]
+    mirrors: list[tuple[Symmetry, int]] = field(default_factory=list)
 
     @property
     def moving(self) -> npt.NDArray[np.bool_]:
@@ -48,22 +55,23 @@ class Supports:
 
     def targets(self, rows: Any, columns: Any, t: float) -> Array:
         """Prescribed values of entries (rows, columns) at time t [s]."""
-        factors = np.array([float(h(t)) for h in self.histories])
+        at = np.array([t], dtype=np.float64)
+        factors = np.concatenate([np.atleast_1d(self.factors(h, at)) for h in self.histories])
         return self.value[rows, columns] * factors[self.history[rows, columns]]
 
 
 def entities(scene: Scene, thing: Any) -> Ints | None:
     """Facets of this rank that a support or surface load names; None for a node predicate.
 
-    Collective.
+    Faces of a periodic scene that are one with another are no boundary. Collective.
 
     Raises:
-        SceneError: if a predicate of facets fails (on all ranks).
+        SceneError: if a predicate of facets fails, or a load is on such a face (on all ranks).
     """
     mesh, where = scene.mesh, thing.where
     exterior = _compat.exterior_facets(mesh)
     if isinstance(where, str):
-        return exterior
+        return exterior if scene.identified is None else scene.identified.outer(exterior)
     if callable(where):
         if isinstance(thing, Fix):
             return None
@@ -76,30 +84,15 @@ def entities(scene: Scene, thing: Any) -> Ints | None:
 
         found = dmesh.locate_entities_boundary(mesh, mesh.topology.dim - 1, marker)
         agree(mesh.comm, next((e for e in errors if e is not None), None))
-        return np.intersect1d(found, exterior)
-    tags = np.atleast_1d(np.asarray(where))
-    facets = scene.facet_tags.indices[np.isin(scene.facet_tags.values, tags)]
-    return facets if isinstance(thing, Fix) else np.intersect1d(facets, exterior)
-
-
-def _mask(what: str, where: Any, x: Array) -> tuple[npt.NDArray[np.bool_], Exception | None]:
-    """Where a user's predicate holds at points x (3, npts); nowhere if it fails, and why."""
-    none = np.zeros(x.shape[1], np.bool_)
-    if not x.shape[1]:
-        return none, None  # ranks without points have nothing to ask
-    try:
-        mask = np.asarray(where(x))
-    except Exception as found:  # a user's callable may fail in any way
-        return none, SceneError(
-            f"{what}: the predicate cannot be evaluated: {type(found).__name__}: {found}. Give a "
-            "function of x (3, npts) -> bool (npts,)."
-        )
-    if mask.shape != none.shape:
-        return none, SceneError(
-            f"{what}: the predicate returned shape {mask.shape} for {x.shape[1]} points. Return "
-            "one truth value per column of x."
-        )
-    return mask.astype(np.bool_), None
+    else:
+        tags = np.atleast_1d(np.asarray(where))
+        found = scene.facet_tags.indices[np.isin(scene.facet_tags.values, tags)]
+        if isinstance(thing, Fix):
+            return found
+    found = np.intersect1d(found, exterior)
+    if scene.identified is not None:
+        scene.identified.refuse_load(type(thing).__name__, found)
+    return found
 
 
 def supports(scene: Scene, action: Action) -> Supports:
@@ -107,17 +100,22 @@ def supports(scene: Scene, action: Action) -> Supports:
 
     Raises:
         SceneError: if a support selects nothing, has the wrong number of components, or clashes
-            with another one (on all ranks).
+            with another one, also across periodic faces (on all ranks).
     """
     mesh, comm = scene.mesh, scene.mesh.comm
     x = np.asarray(mesh.geometry.x)
     shape = (len(x), scene.components)
     out = Supports(np.zeros(shape, bool), np.zeros(shape), np.zeros(shape, np.int32), [Constant()])
     error: Exception | None = None
-    for fix in scene.supports:
-        facets = entities(scene, fix)
+    for support in scene.supports:
+        facets = entities(scene, support)
+        what = type(support).__name__
+        if isinstance(support, Symmetry):
+            fixes = _mirror(scene, support, facets, out)
+        else:
+            fixes, what = [support], f"Fix({support.field!r})"
         if facets is None:
-            mask, problem = _mask(f"Fix({fix.field!r})", fix.where, x.T)
+            mask, problem = _mask(what, support.where, x.T)
             agree(comm, problem)
             nodes = np.flatnonzero(mask)
         else:
@@ -126,12 +124,30 @@ def supports(scene: Scene, action: Action) -> Supports:
             nodes = np.asarray(fem.locate_dofs_topological(action.space, dim, facets))
         if comm.allreduce(len(nodes)) == 0 and error is None:
             error = SceneError(
-                f"Fix({fix.field!r}, where={fix.where!r}) selects no node. Check the predicate's "
+                f"{what} with where={support.where!r} selects no node. Check the predicate's "
                 "tolerance or the tag."
             )
-        error = error or _prescribe(scene, out, fix, nodes, x)
+        for fix in fixes:
+            error = error or _prescribe(scene, out, fix, nodes, x)
     agree(comm, error)
+    if scene.identified is not None:
+        scene.identified.join_supports(out)
+    try_histories(comm, out.histories, 0.0)
     return out
+
+
+def _mirror(scene: Scene, support: Symmetry, facets: Any, out: Supports) -> list[Fix]:
+    """What a plane of symmetry fixes; collective."""
+    if scene.mesh.comm.allreduce(len(facets)) == 0:
+        return []  # which is refused
+    axis = mirror_plane(scene, support, facets)
+    out.mirrors.append((support, axis))
+    fixed = fixed_components(scene, support, axis)
+    return [
+        Fix(name, support.where, components=components.tolist())
+        for name, components in fixed.items()
+        if len(components)
+    ]
 
 
 def _prescribe(scene: Scene, out: Supports, fix: Fix, nodes: Any, x: Any) -> Exception | None:
@@ -183,100 +199,27 @@ def _values(value: Any, points: Array, count: int) -> Array | None:
     """Values (points, count) of a number, a sequence or a callable of x; None if they misfit."""
     if not len(points):
         return np.zeros((0, count))  # ranks without points have nothing to ask
+    found = value(points.T) if callable(value) else value
+    mask = callable(value) and np.asarray(found).dtype == np.bool_  # a predicate means 0 and 1
+    given = numbers(np.asarray(found, dtype=np.int64) if mask else found)
+    if given is None:
+        return None
     try:
         if callable(value):
-            given = np.asarray(value(points.T), dtype=np.float64)
             given = np.broadcast_to(np.atleast_2d(given), (count, len(points))).T
         else:
-            given = np.broadcast_to(np.asarray(value, dtype=np.float64), (len(points), count))
-    except (TypeError, ValueError):
+            given = np.broadcast_to(given, (len(points), count))
+    except ValueError:
         return None
     return given if np.all(np.isfinite(given)) else None
-
-
-@dataclass
-class Loads:
-    """Partial load vectors of this rank: entry i adds ``factor[group[i]]·value[i]`` at its node.
-
-    Attributes:
-        node: Geometry node of each entry.
-        component: Component within the record.
-        group: Index into ``histories``.
-        value: Force at factor 1 [N, or its partner on ν].
-        histories: One per group.
-    """
-
-    node: Ints
-    component: Ints
-    group: npt.NDArray[np.int32]
-    value: Array
-    histories: list[History]
-
-    def amplitudes(self, times: Array) -> Array:
-        """Factors at the times [s], shape (times, groups)."""
-        out = np.ones((len(times), max(len(self.histories), 1)))
-        for i, history in enumerate(self.histories):
-            out[:, i] = np.asarray(history(times), dtype=np.float64)
-        return out
-
-
-def loads(scene: Scene, action: Action) -> Loads:
-    """Assemble the loads of a scene by dolfinx, one vector each, before any halo sum; collective.
-
-    Raises:
-        SceneError: if a load selects nothing or its vector misfits (on all ranks).
-    """
-    comm, mesh = scene.mesh.comm, scene.mesh
-    rows: list[tuple[Any, ...]] = []
-    histories: list[History] = []
-    for load in scene.loads:
-        tags = None
-        if not isinstance(load, BodyForce):
-            facets = np.sort(entities(scene, load)).astype(np.int32)  # type: ignore[arg-type]
-            if comm.allreduce(len(facets)) == 0:
-                raise SceneError(
-                    f"{type(load).__name__}(where={load.where!r}) selects no boundary facet. Check "
-                    "the predicate's tolerance or the tag."
-                )
-            ones = np.full(len(facets), 1, dtype=np.int32)
-            tags = dmesh.meshtags(mesh, mesh.topology.dim - 1, facets, ones)
-        error: Exception | None = None
-        form = None
-        try:
-            form = action.load_form(load, tags, 1)
-        except SceneError as found:
-            error = found
-        except Exception as found:  # a user's callable may fail in any way
-            error = SceneError(
-                f"{type(load).__name__}: vector cannot be evaluated: {type(found).__name__}: "
-                f"{found}. Give numbers, or a callable of x (3, npts) -> (components, npts)."
-            )
-        agree(comm, error)
-        vector = np.zeros(_compat.node_count(mesh) * scene.components)
-        fem.assemble_vector(vector, _compat.form(form))
-        if not np.all(np.isfinite(vector)):
-            error = SceneError(
-                f"{type(load).__name__}: the load is not finite everywhere. Check its vector or "
-                "pressure."
-            )
-        agree(comm, error)
-        entry = np.flatnonzero(vector)
-        if load.history not in histories:
-            histories.append(load.history)
-        group = np.full(len(entry), histories.index(load.history), np.int32)
-        rows.append((entry // scene.components, entry % scene.components, group, vector[entry]))
-    if not rows:
-        empty = np.zeros(0, np.int64)
-        return Loads(empty, empty, empty.astype(np.int32), np.zeros(0), [])
-    node, component, group, value = (np.concatenate(c) for c in zip(*rows, strict=True))
-    return Loads(node.astype(np.int64), component.astype(np.int64), group, value, histories)
 
 
 def initial(scene: Scene, action: Action) -> tuple[Array, Array]:
     """Initial fields and rates over geometry nodes, shapes (geometry nodes, n); collective.
 
     Raises:
-        SceneError: if an initial field has the wrong shape or non-finite values (on all ranks).
+        SceneError: if an initial field has the wrong shape or non-finite values, or differs at
+            nodes that are one (on all ranks).
     """
     x = np.asarray(scene.mesh.geometry.x)
     fields = np.zeros((len(x), scene.components))
@@ -312,4 +255,7 @@ def initial(scene: Scene, action: Action) -> tuple[Array, Array]:
             else:
                 target[:, columns] = given
     agree(scene.mesh.comm, error)
+    if scene.identified is not None:
+        scene.identified.join_initial(fields, "fields")
+        scene.identified.join_initial(rates, "rates")
     return fields, rates

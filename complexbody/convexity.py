@@ -35,6 +35,7 @@ class Range:
         gamma: Smallest eigenvalue γ of ∂²χ/∂ν̇∂ν̇ (A5).
         mixed, second: Ξ, largest norms of ∂²χ/∂ν∂ν̇ and ∂²χ/∂ν∂ν (A4).
         first_limit, second_limit: T₀ of the first- and the second-order scheme [s].
+        first_place, second_place: Where they were found, in words.
     """
 
     gamma: float = np.inf
@@ -42,9 +43,15 @@ class Range:
     second: float = 0.0
     first_limit: float = np.inf
     second_limit: float = np.inf
+    first_place: str = ""
+    second_place: str = ""
 
     def widen(self, other: Range) -> None:
         """Take in another range."""
+        if other.first_limit < self.first_limit:
+            self.first_place = other.first_place
+        if other.second_limit < self.second_limit:
+            self.second_place = other.second_place
         self.gamma = min(self.gamma, other.gamma)
         self.mixed, self.second = max(self.mixed, other.mixed), max(self.second, other.second)
         self.first_limit = min(self.first_limit, other.first_limit)
@@ -53,6 +60,10 @@ class Range:
     def limit(self, order: int) -> float:
         """T₀ of the scheme of this order [s]."""
         return self.first_limit if order == 1 else self.second_limit
+
+    def place(self, order: int) -> str:
+        """Where T₀ of the scheme of this order was found, in words."""
+        return self.first_place if order == 1 else self.second_place
 
 
 class Convexity:
@@ -91,14 +102,28 @@ class Convexity:
             nodes = _compat.cell_nodes(self.scene.mesh)[cells].ravel()
             error = error or self._broken(r, blocks, nodes, nu, rate)
             if error is None:
-                out[r] = _range(blocks)
+                out[r], least = _range(blocks)
+                for name, at in least.items():
+                    setattr(out[r], name, self._place(nodes[at]))
         agree(self.comm, error)
         for found in out.values():
-            for name in ("gamma", "first_limit", "second_limit"):
-                setattr(found, name, self.comm.allreduce(getattr(found, name), op=MPI.MIN))
+            for order in ("first", "second"):
+                limit, place = f"{order}_limit", f"{order}_place"
+                mine = getattr(found, limit), self.comm.rank, getattr(found, place)
+                smallest = min(self.comm.allgather(mine))
+                setattr(found, limit, smallest[0])
+                setattr(found, place, smallest[2])
+            found.gamma = self.comm.allreduce(found.gamma, op=MPI.MIN)
             for name in ("mixed", "second"):
                 setattr(found, name, self.comm.allreduce(getattr(found, name), op=MPI.MAX))
         return out
+
+    def _place(self, node: int) -> str:
+        """A geometry node of this rank in words."""
+        geometry = self.scene.mesh.geometry
+        number = int(np.asarray(geometry.input_global_indices)[node])
+        where = np.round(geometry.x[node, : geometry.dim], 9).tolist()
+        return f"node {number} at {where}, rank {self.comm.rank}"
 
     def _broken(self, r: int, blocks: Array, nodes: Any, nu: Array, rate: Array) -> Any:
         finite = np.isfinite(blocks).all(axis=(1, 2, 3))
@@ -107,26 +132,26 @@ class Convexity:
         if not bad.size:
             return None
         at, node = bad[0], nodes[bad[0]]
-        where = np.round(self.scene.mesh.geometry.x[node, : self.scene.mesh.geometry.dim], 9)
         what = f"is not convex in ν̇ (A5: γ = {least[at]:.3g})" if finite[at] else (
             "has no finite second derivatives (A4)"
         )  # fmt: skip
         return BodyError(
-            f"The kinetic co-energy of {self.scene.bodies[r].name} {what} at {where.tolist()}, "
+            f"The kinetic co-energy of {self.scene.bodies[r].name} {what} in {self._place(node)}, "
             f"ν = {nu[node].tolist()}, ν̇ = {rate[node].tolist()}. Change the inertia, or keep the "
             "descriptor away from there."
         )
 
 
-def _range(blocks: Array) -> Range:
-    """γ, Ξ and T₀ of second derivatives (points, 3, k, k)."""
+def _range(blocks: Array) -> tuple[Range, dict[str, int]]:
+    """γ, Ξ and T₀ of second derivatives (points, 3, k, k), and the points where T₀ is smallest."""
     if not len(blocks):
-        return Range()
+        return Range(), {}
     gamma = np.linalg.eigvalsh(blocks[:, 0])[:, 0]
     mixed, second = (np.linalg.norm(blocks[:, i], axis=(1, 2)) for i in (1, 2))
     with np.errstate(divide="ignore"):
         first, midpoint = gamma / mixed, 2 * np.sqrt(gamma / second)
-    return Range(
+    found = Range(
         float(gamma.min()), float(mixed.max()), float(second.max()),
         float(first.min()), float(midpoint.min()),
     )  # fmt: skip
+    return found, {"first_place": int(first.argmin()), "second_place": int(midpoint.argmin())}

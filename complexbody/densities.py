@@ -1,14 +1,19 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Calling a user's density: a scalar UFL expression, or a clear error."""
+"""Calling a user's density: a scalar UFL expression, or a clear error; and F for those in F."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
 import ufl
+from ufl.algorithms.analysis import extract_arguments
+from ufl.classes import Condition, ScalarValue
+from ufl.corealg.traversal import unique_pre_traversal
 
 from complexbody.errors import BodyError
+from complexbody.given import short
 
 
 def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -32,4 +37,39 @@ def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
             f"The {what} has shape {value.ufl_shape}{free}, but a density is a scalar. Contract "
             "its indices, for instance with ufl.inner."
         )
+    if isinstance(value, Condition) or extract_arguments(value):
+        raise BodyError(
+            f"The {what} is no number: {short(value)}. Return a scalar expression of its "
+            "arguments, for instance with ufl.conditional."
+        )
+    for part in unique_pre_traversal(value):
+        if isinstance(part, ScalarValue) and not _is_finite(part):
+            raise BodyError(f"The {what} has the constant {short(part)}. Give finite real numbers.")
     return value
+
+
+def deformation(U: Any) -> Any:
+    """F = I + ∇u of U = ∇u, shape (n_u, 3), as a 3×3 UFL tensor for energies e(F, ν, N).
+
+    Where u has less than three components the missing ones are zero (plane strain).
+
+    Raises:
+        BodyError: for more than three rows.
+    """
+    rows = U.ufl_shape[0]
+    if rows > 3:
+        raise BodyError(f"deformation: U has {rows} rows, but space has three. Give n_u ≤ 3.")
+    return ufl.as_tensor(
+        [
+            [(U[i, j] if i < rows else ufl.as_ufl(0.0)) + (1.0 if i == j else 0.0)
+             for j in range(3)]
+            for i in range(3)
+        ]
+    )  # fmt: skip
+
+
+def _is_finite(constant: Any) -> bool:
+    try:
+        return math.isfinite(float(constant))
+    except (TypeError, OverflowError):  # complex, or hundreds of digits
+        return False

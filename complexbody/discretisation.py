@@ -9,6 +9,7 @@ later cell needs it. Knows no energy and no integrator.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -60,7 +61,8 @@ class Discretisation:
     Attributes:
         nodes: Nodes of this rank's owned cells, in own numbering 0 … nodes−1.
         late: First of the nodes updated apart: shared nodes (``shared`` of them) come first.
-        dof: dolfinx geometry number of each node.
+        dof: dolfinx geometry number of each node; of a periodic scene, of one of its copies.
+        number: Own number of each geometry node of dolfinx (−1 if no cell here has it).
         count: Cells of this rank, without padding.
         cells: Node numbers, shape (blocks, d+1, W); padding cells have node number ``nodes``.
         source_cell: dolfinx cell of each (block, lane), −1 for padding.
@@ -88,25 +90,29 @@ class Discretisation:
         self.record, self.lanes = padded(self.n), native.lanes()
         mesh = scene.mesh
         owned_cells = _compat.cell_count(mesh)[0]
-        nodes = _compat.cell_nodes(mesh)[:owned_cells]
+        corners = nodes = _compat.cell_nodes(mesh)[:owned_cells]
         x = np.asarray(mesh.geometry.x, dtype=np.float64)
         edges = x[nodes[:, 1:], : self.dim] - x[nodes[:, :1], : self.dim]
         self._check_cells(edges, nodes, x)
 
-        index_map = _compat.node_map(mesh)
+        self.identified = scene.identified
+        if self.identified is not None:
+            nodes = self.identified.local[nodes]
         touched = np.zeros(len(x), np.bool_)
         touched[nodes] = True
-        shared = sharing(index_map, touched, self.comm)
+        used = np.flatnonzero(touched)
+        shared = sharing(self.names(used), _compat.node_map(mesh), self.comm)
+        shared = {int(used[row]): ranks for row, ranks in shared.items()}
         is_shared = np.zeros(len(x), np.bool_)
         is_shared[list(shared)] = True
         boundary = is_shared[nodes].any(axis=1)
 
         regions = scene.regions()
-        key = morton(x[nodes, : self.dim].mean(axis=1))
+        key = morton(x[corners, : self.dim].mean(axis=1))
         groups = np.zeros(owned_cells, np.int64) if group is None else group
         order = np.lexsort((key, groups, regions, ~boundary))
         self._block(order, regions, groups, boundary)
-        number = self._number(nodes, touched, is_shared, late, index_map)
+        number = self._number(nodes, touched, is_shared, late)
         lanes = np.where(self.source_cell < 0, 0, self.source_cell)
         table = number[nodes[lanes]]
         table[self.source_cell < 0] = self.nodes
@@ -115,17 +121,16 @@ class Discretisation:
         self._chunks(boundary)
 
         position = {int(number[d]) - self.late: r for d, r in shared.items()}
-        global_number = np.zeros(self.shared, np.int64)
-        if self.shared:
-            dofs = self.dof[self.late : self.late + self.shared]
-            global_number = np.asarray(index_map.local_to_global(dofs.astype(np.int32)))
+        names = self.names(self.dof[self.late : self.late + self.shared])
         # Messages are records, back to back: the time loops pack them so.
-        self.halo = Halo(self.comm, position, global_number, self.record)
+        self.halo = Halo(self.comm, position, names, self.record)
         self.owned = np.ones(self.nodes, np.bool_)
         self.owned[self.late : self.late + self.shared] = self.halo.owner
         self._volumes(len(scene.bodies))
         self.position = np.zeros((self.nodes + 1, 3))
         self.position[:-1] = x[self.dof]
+        if self.identified is not None:
+            self.position[:-1] = self.identified.placed(self.dof)
 
     def _check_cells(self, edges: Array, nodes: Any, x: Array) -> None:
         error: Exception | None = None
@@ -162,7 +167,7 @@ class Discretisation:
         self.blocks, self.count = len(self.region), len(order)
         self.boundary_blocks = int(np.sum(interior == 0))
 
-    def _number(self, nodes: Any, touched: Any, is_shared: Any, late: Any, index_map: Any) -> Any:
+    def _number(self, nodes: Any, touched: Any, is_shared: Any, late: Any) -> Any:
         """Number nodes by their last block; shared nodes, then other late ones, at the end."""
         last = np.full(len(touched), -1, np.int64)
         real = self.source_cell >= 0
@@ -180,6 +185,8 @@ class Discretisation:
         self.nodes, self.shared = len(used), int(is_shared.sum())
         self.late = int(np.sum(rank[used] == 0))
         self._last = last[self.dof[: self.late]]
+        if self.identified is not None:
+            number = number[self.identified.local]
         self.number = number
         return number
 
@@ -213,7 +220,7 @@ class Discretisation:
         self.boundary_chunks = int(np.sum(self.chunks[:, 1] <= self.boundary_blocks))
 
     def _runs(self) -> list[int]:
-        change = np.flatnonzero(np.diff(self.region)) + 1
+        change = np.flatnonzero((np.diff(self.region) != 0) | (np.diff(self.group) != 0)) + 1
         return sorted({int(c) for c in change} | {self.boundary_blocks} - {0})
 
     def _volumes(self, regions: int) -> None:
@@ -290,12 +297,43 @@ class Discretisation:
         agree(self.comm, error)
         return self.nodal_average(values)
 
+    @cached_property
+    def corners(self) -> Array | None:
+        """Coordinates of cells' vertices (blocks, W, d+1, 3) where nodes have copies, else None."""
+        if self.identified is None:
+            return None
+        lanes = np.where(self.source_cell < 0, 0, self.source_cell)
+        nodes = _compat.cell_nodes(self.scene.mesh)[lanes]
+        return np.ascontiguousarray(self.scene.mesh.geometry.x[nodes], dtype=np.float64)
+
+    def names(self, dofs: Any) -> Any:
+        """Global numbers that all ranks know geometry nodes by, the same for all copies of one."""
+        index_map = _compat.node_map(self.scene.mesh)
+        numbers = np.asarray(index_map.local_to_global(dofs.astype(np.int32)), dtype=np.int64)
+        return numbers if self.identified is None else self.identified.named(numbers, dofs)
+
     def gather(self, function_values: Array) -> Array:
         """Records (nodes, m) from an array over dolfinx's nodes (geometry nodes, m)."""
         return np.ascontiguousarray(function_values[self.dof])
 
+    def gather_sum(self, parts: Array) -> Array:
+        """Records (nodes, m) from this rank's parts at dolfinx's nodes, those of copies summed."""
+        if self.identified is None:
+            return self.gather(parts)
+        out = np.zeros((self.nodes, *parts.shape[1:]))
+        here = self.number >= 0
+        np.add.at(out, self.number[here], parts[here])
+        return out
+
+    def spread(self, values: npt.NDArray[Any], out: npt.NDArray[Any]) -> None:
+        """Set ``out`` (geometry nodes, …) from nodal values (nodes, …), at all copies of nodes."""
+        if self.identified is None:
+            out[self.dof] = values
+        else:
+            here = self.number >= 0
+            out[here] = values[self.number[here]]
+
     def scatter(self, values: Array, function: Any) -> None:
         """Set a P1 Function of m components from nodal values (nodes, m); collective."""
-        m = values.shape[1]
-        function.x.array.reshape(-1, m)[self.dof] = values
+        self.spread(values, function.x.array.reshape(-1, values.shape[1]))
         function.x.scatter_forward()

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from complexbody import meshes
 from complexbody.growth import ENOUGH, weights
 from complexbody.problem import Problem
-from complexbody.scene import Initial, Scene
+from complexbody.scene import Fix, Initial, Scene
 from complexbody.timesets import critical_step
 
 Array = npt.NDArray[np.float64]
@@ -43,7 +43,10 @@ class Disturbed(Problem):
 
     def __init__(self, scene: Scene, disturbed: bool = True) -> None:
         self._disturbed, self.unit, self.linear = disturbed, 1.0, False
-        supports = [replace(fix, value=_zero(fix.value)) for fix in scene.supports]
+        supports = [
+            replace(fix, value=_zero(fix.value)) if isinstance(fix, Fix) else fix
+            for fix in scene.supports
+        ]
         given = scene.initial
         start = Initial(given.u, given.nu)
         super().__init__(replace(scene, loads=(), supports=supports, initial=start))

@@ -24,6 +24,18 @@ class CoercivityError(BodyError):
     """The Hessian of the energy density is not symmetric, not finite or not coercive (A1)."""
 
 
+class PrestressError(BodyError):
+    """A state to linearise about is not natural: P̄, z̄ or S̄ is not zero there.
+
+    Attributes:
+        prestress: The :class:`complexbody.linearise.Prestress` there.
+    """
+
+    def __init__(self, message: str, prestress: Any = None) -> None:
+        super().__init__(message)
+        self.prestress = prestress
+
+
 class SceneError(ComplexBodyError, ValueError):
     """A scene does not fit together: supports, loads, tags, initial data."""
 
@@ -42,6 +54,12 @@ class StepError(IntegratorError):
 
 class OutputError(ComplexBodyError, OSError):
     """Results cannot be written where the user asked."""
+
+
+class CheckpointError(ComplexBodyError):
+    """A run cannot be resumed: no checkpoint is whole, or of this scene; or none can be made."""
+
+    exit_code = 6
 
 
 class ResultsError(ComplexBodyError, ValueError):
@@ -67,9 +85,18 @@ class MissingPackage(ComplexBodyError, ImportError):
 
 
 class DivergenceError(ComplexBodyError, ArithmeticError):
-    """A run produced non-finite values or energy it was not given."""
+    """A run produced non-finite values, energy it was not given, or cells turned inside out.
+
+    Attributes:
+        ledger: The books up to the row that stopped it, where a ledger was kept.
+        last_good: Time of the last row in which all was well [s], None if there was none.
+        place: The node or cell, a :class:`complexbody.guards.Place`, or None if all are alike.
+    """
 
     exit_code = 4
+    ledger: Any = None
+    last_good: float | None = None
+    place: Any = None
 
 
 class SolverError(ComplexBodyError, ArithmeticError):

@@ -43,8 +43,7 @@ class RunMap:
     def __init__(self, run: Any, spans: int = 1) -> None:
         self.run, self.spans = run, spans
         problem = run.problem
-        if getattr(run, "activity", None) is not None:
-            run.activity.stop()  # cells at rest are set moving by hand
+        run.wake()  # cells at rest are set moving by hand
         self._rows, self._columns = np.nonzero(~problem.masses.fixed[problem.masses.classes[:-1]])
         self.free = len(self._rows)
         self._held: list[tuple[int, int, Array]] = []
@@ -151,7 +150,7 @@ def weights(problem: Any, step: float) -> Array:
     """Inertia per class and component, hη where there is none; 0 on supports. (classes, n)."""
     masses = problem.masses
     mass = np.einsum("cii->ci", masses.full(masses.inertia, masses.density))
-    loss = np.einsum("cii->ci", masses.full(masses.viscosity)) * step
+    loss = np.einsum("cii->ci", masses.damping) * step
     return np.where(masses.fixed, 0.0, np.where(mass > 0, mass, loss))
 
 

@@ -17,45 +17,47 @@ from mpi4py import MPI
 Ints = npt.NDArray[np.int64]
 
 
-def sharing(index_map: Any, touched: npt.NDArray[np.bool_], comm: Any) -> dict[int, list[int]]:
+def sharing(numbers: Ints, index_map: Any, comm: Any) -> dict[int, list[int]]:
     """Which ranks' owned cells touch each node that this rank shares; collective.
 
     Args:
-        index_map: dolfinx index map of the nodes (owned first, then ghosts).
-        touched: True for local nodes of this rank's owned cells, shape (owned + ghosts,).
+        numbers: Global numbers of the nodes of this rank's owned cells, each once, in any order.
+        index_map: dolfinx index map of the nodes: the owner of a number knows who touches it.
         comm: The mesh's communicator.
 
     Returns:
-        {local node: sorted ranks, this one included} for nodes touched by two ranks or more.
+        {row of ``numbers``: sorted ranks, this one included} for nodes touched by two ranks or
+        more.
     """
     if comm.size == 1:
         return {}
-    owned, first = index_map.size_local, index_map.local_range[0]
-    ghosts = np.asarray(index_map.ghosts, dtype=np.int64)
-    owners = np.asarray(
-        index_map.owners if not callable(index_map.owners) else index_map.owners(), dtype=np.int64
-    )
-    mine = np.flatnonzero(touched[owned:])
-    asked = [ghosts[mine[owners[mine] == r]] for r in range(comm.size)]
-    heard = comm.alltoall(asked)
+    first = np.concatenate([[0], np.cumsum(comm.allgather(int(index_map.size_local)))])
+    owner = np.searchsorted(first, numbers, side="right") - 1
+    elsewhere = np.flatnonzero(owner != comm.rank)
+    row_of = dict(zip(numbers[elsewhere].tolist(), elsewhere.tolist(), strict=True))
+    # Rows of what this rank owns: most of its nodes, so by a table.
+    start, row = int(first[comm.rank]), np.full(int(index_map.size_local), -1, np.int64)
+    here = np.flatnonzero(owner == comm.rank)
+    row[numbers[here] - start] = here
+    asked = [numbers[elsewhere[owner[elsewhere] == r]] for r in range(comm.size)]
     ranks: dict[int, list[int]] = {}
-    for rank, nodes in enumerate(heard):
+    for rank, nodes in enumerate(comm.alltoall(asked)):
         for node in nodes:
-            ranks.setdefault(int(node) - first, []).append(rank)
+            ranks.setdefault(int(node), []).append(rank)
     replies: list[list[tuple[int, list[int]]]] = [[] for _ in range(comm.size)]
     shared: dict[int, list[int]] = {}
     for node, others in ranks.items():
-        everyone = sorted(set(others + ([comm.rank] if touched[node] else [])))
+        mine = int(row[node - start])
+        everyone = sorted([*others, comm.rank] if mine >= 0 else others)
         if len(everyone) < 2:
             continue
-        if touched[node]:
-            shared[node] = everyone
+        if mine >= 0:
+            shared[mine] = everyone
         for rank in others:
-            replies[rank].append((node + first, everyone))
-    local = {int(g): owned + i for i, g in enumerate(ghosts)}
+            replies[rank].append((node, everyone))
     for answer in comm.alltoall(replies):
         for node, everyone in answer:
-            shared[local[node]] = everyone
+            shared[row_of[node]] = everyone
     return shared
 
 

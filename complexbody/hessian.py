@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +27,12 @@ from complexbody import _compat
 Array = npt.NDArray[np.float64]
 #: Monomial (sorted indices of unknowns, at most two) -> coefficient (float or UFL scalar).
 Poly = dict[tuple[int, ...], Any]
+
+
+_COMPARED = {
+    uc.EQ: operator.eq, uc.NE: operator.ne, uc.LT: operator.lt, uc.LE: operator.le,
+    uc.GT: operator.gt, uc.GE: operator.ge,
+}  # fmt: skip
 
 
 class NotQuadratic(Exception):
@@ -83,7 +90,7 @@ def read(density: Callable[..., Any], mesh: Any, n_u: int, k: int, values: str) 
         return None
 
     expression = density(U, nu, N) if values == "gradients" else density(u, nu)
-    reader = _Reader(unknown)
+    reader = Reader(unknown)
     try:
         return _read(reader, expression)
     except NotQuadratic:
@@ -129,12 +136,12 @@ def read_at(
     expression = ufl.as_ufl(density(*variables))
     slope = varied(expression)
     try:
-        return _read(_Reader(unknown), expression + slope + 0.5 * varied(slope))
+        return _read(Reader(unknown), expression + slope + 0.5 * varied(slope))
     except (ZeroDivisionError, ValueError, OverflowError):
         raise NotQuadratic from None  # a function at the edge of where it is defined
 
 
-def _read(reader: _Reader, expression: Any) -> Quadratic:
+def _read(reader: Reader, expression: Any) -> Quadratic:
     lowered = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(expression)))
     poly = reader.visit(lowered, (), {})
     hessian: dict[tuple[int, int], Any] = {}
@@ -146,15 +153,49 @@ def _read(reader: _Reader, expression: Any) -> Quadratic:
     return Quadratic(poly.get((), 0.0), linear, hessian, reader.cellwise)
 
 
-class _Reader:
+def quadratic_in_gradient(density: Callable[..., Any], mesh: Any, n_u: int, k: int) -> bool:
+    """Whether ``e(U, nu, N)`` is a polynomial of degree two in U alone, whatever it is in ν and N.
+
+    Args:
+        density: The stored energy density.
+        mesh: The dolfinx mesh, whose dimension says which columns of U exist.
+        n_u: Components of u.
+        k: Components of ν.
+    """
+    domain = mesh.ufl_domain()
+    U, nu, N = (ufl.Constant(domain, shape=s) for s in ((n_u, 3), (k,), (k, 3)))
+
+    def unknown(terminal: Any, component: tuple[int, ...]) -> Poly | None:
+        if terminal is not U:
+            return None
+        i, j = component
+        return {(3 * i + j,): 1.0} if j < mesh.geometry.dim else {}
+
+    try:
+        lowered = apply_derivatives(apply_algebra_lowering(ufl.as_ufl(density(U, nu, N))))
+        Reader(unknown).visit(lowered, (), {})
+    except NotQuadratic:
+        return False
+    return True
+
+
+class Reader:
     """Evaluates lowered UFL over polynomials; ``cellwise`` turns False at a varying coefficient."""
 
     def __init__(self, unknown: Callable[[Any, tuple[int, ...]], Poly | None]) -> None:
         self.unknown = unknown
         self.cellwise = True
+        self._known: dict[tuple[Any, ...], tuple[Any, Poly]] = {}
 
     def visit(self, e: Any, c: tuple[int, ...], at: dict[Any, int]) -> Poly:
         """Polynomial of component ``c`` of ``e`` with free indices bound by ``at``."""
+        # Derivatives share most of their parts: each is to be read once.
+        key = (id(e), c, *(at[i] for i in e.ufl_free_indices))
+        if key not in self._known:
+            self._known[key] = e, self._read(e, c, at)  # e too: its id must not be given away
+        return self._known[key][1]
+
+    def _read(self, e: Any, c: tuple[int, ...], at: dict[Any, int]) -> Poly:
         ops = e.ufl_operands
         if isinstance(e, uc.Zero):
             return {}
@@ -185,6 +226,8 @@ class _Reader:
             return self._over(self.visit(ops[0], c, at), self.visit(ops[1], (), at))
         if isinstance(e, uc.Power):
             return self._power(self.visit(ops[0], (), at), self.visit(ops[1], (), at))
+        if isinstance(e, uc.Conditional):
+            return self.visit(ops[1] if self._holds(ops[0], at) else ops[2], c, at)
         if not ops or isinstance(e, uc.Derivative):  # gradients of coefficients are left, no others
             known = self.unknown(e, c)
             return self._coefficient(e, c) if known is None else known
@@ -217,13 +260,26 @@ class _Reader:
             return {(): 1.0}
         return base if p == 1.0 else _product(base, base)
 
+    def _holds(self, e: Any, at: dict[Any, int]) -> bool:
+        """Whether a condition on numbers holds; of anything else it says nothing."""
+        if isinstance(e, uc.NotCondition):
+            return not self._holds(e.ufl_operands[0], at)
+        if isinstance(e, uc.AndCondition | uc.OrCondition):
+            both = [self._holds(o, at) for o in e.ufl_operands]
+            return all(both) if isinstance(e, uc.AndCondition) else any(both)
+        sides = [self.visit(o, (), at) for o in e.ufl_operands]
+        values = [side.get((), 0.0) for side in sides]
+        if any(any(side) for side in sides) or not all(isinstance(v, float) for v in values):
+            raise NotQuadratic
+        return bool(_COMPARED[type(e)](*values))
+
     def _function(self, e: Any, arguments: list[Poly]) -> Poly:
         # A function of coefficients alone is a coefficient; of an unknown, no polynomial.
-        if any(any(a) for a in arguments) or isinstance(e, uc.Conditional | uc.Condition):
+        if any(any(a) for a in arguments):
             raise NotQuadratic
         operands = [ufl.as_ufl(a.get((), 0.0)) for a in arguments]
         value = e._ufl_expr_reconstruct_(*operands)
-        if isinstance(value, uc.Zero):  # which is no ScalarValue
+        if isinstance(value, uc.Zero):  # as ln 1: no ScalarValue
             return {}
         return _constant(float(value)) if isinstance(value, uc.ScalarValue) else {(): value}
 

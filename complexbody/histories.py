@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from complexbody.errors import SceneError
+from complexbody.given import is_finite, is_number, is_positive, numbers, short
 
 
 class History(Protocol):
@@ -23,20 +24,16 @@ class History(Protocol):
         """The factor at the times ``t`` [s], of the same shape."""
 
 
-def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float | np.integer | np.floating) and bool(np.isfinite(value))
-
-
 def _positive(where: str, **values: Any) -> None:
     for name, value in values.items():
-        if not (_is_finite(value) and value > 0):
-            raise SceneError(f"{where}: {name} is {value!r}. Give a positive {name}.")
+        if not is_positive(value):
+            raise SceneError(f"{where}: {name} is {short(value)}. Give a positive {name}.")
 
 
 def _finite(where: str, **values: Any) -> None:
     for name, value in values.items():
-        if not _is_finite(value):
-            raise SceneError(f"{where}: {name} is {value!r}. Give a finite {name}.")
+        if not is_finite(value):
+            raise SceneError(f"{where}: {name} is {short(value)}. Give a finite {name}.")
 
 
 @dataclass(frozen=True)
@@ -163,8 +160,10 @@ def step(start: float = 0.0, end: float = np.inf) -> Step:
     Raises:
         SceneError: if the end is not after the start.
     """
-    if not end > start:
-        raise SceneError(f"step: end {end} is not after start {start}. Give end > start.")
+    if not (is_number(start) and is_number(end) and end > start):
+        raise SceneError(
+            f"step: end {short(end)} is not after start {short(start)}. Give end > start."
+        )
     return Step(float(start), float(end))
 
 
@@ -185,7 +184,9 @@ def table(times: Sequence[float], values: Sequence[float]) -> Table:
     Raises:
         SceneError: if the lengths differ, or the times do not increase, or a value is not finite.
     """
-    t, v = np.asarray(times, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    t, v = numbers(times), numbers(values)
+    if t is None or v is None:
+        raise SceneError("table: times or values are no numbers. Give two lists of numbers.")
     if t.ndim != 1 or t.shape != v.shape or t.size == 0:
         raise SceneError(
             f"table: times have shape {t.shape} and values {v.shape}. Give two lists of one length."

@@ -6,7 +6,8 @@ along e, and at the two ends, for the live components that are free there (o) an
 forces do not bend them: H has no entry between ∂_e o and anything of o but its ∂_e (so that natural
 conditions hold), and none between c, but for its ∂_e, and o (so that c stays zero). Data are looked
 at as the user gave them: callables at points moved along e. What cannot be looked at (tags, data
-given as Functions, densities that are not quadratic) leaves the question open.
+given as Functions, densities that are not quadratic), absorbing boundaries and mirrors leave the
+question open.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from mpi4py import MPI
 from complexbody import _compat
 from complexbody.body import Body
 from complexbody.problem import Problem
-from complexbody.scene import BodyForce, Fix, Pressure
+from complexbody.scene import BodyForce, Fix, PointSource, Pressure
 
 Array = npt.NDArray[np.float64]
 AXES = "xyz"
@@ -29,6 +30,8 @@ AXES = "xyz"
 def invariant_axes(problem: Problem) -> list[int]:
     """Axes (0, 1, 2) of the mesh along which no field of the scene varies; collective."""
     scene, dim = problem.whole, problem.disc.dim
+    if scene.identified is not None and not scene.identified.boxed:
+        return []  # a vector may lead out of the cross-section
     if dim == 1 or not isinstance(scene.body, Body) or not problem.kernels.densities.generated[0]:
         return []
     if problem.kernels.densities.coefficients or hasattr(scene.body.density, "function_space"):
@@ -106,7 +109,11 @@ def _data(problem: Problem, axis: int) -> bool:
     tiny = 1e-9 * (high - low)
     inner = x[:, (x[axis] > low + tiny) & (x[axis] < high - tiny)]
     values = [scene.initial.u, scene.initial.nu, scene.initial.u_dot, scene.initial.nu_dot]
+    if scene.absorbing:
+        return False
     for load in scene.loads:
+        if isinstance(load, PointSource):
+            return False
         if isinstance(load, BodyForce):
             if load.where is not None:
                 return False
@@ -114,6 +121,8 @@ def _data(problem: Problem, axis: int) -> bool:
             return False
         values.append(0.0 if isinstance(load, Pressure) else load.vector)
     for fix in scene.supports:
+        if not isinstance(fix, Fix):
+            return False
         if not callable(fix.where) or not _same(fix.value, x, axis, low, high):
             return False
         if not _at_ends(fix, x, axis, low, high) and not _same(fix.where, inner, axis, low, high):
@@ -132,6 +141,8 @@ def _at_ends(fix: Fix, x: Array, axis: int, low: float, high: float) -> bool:
 
 def _ends(problem: Problem, axis: int) -> bool:
     """Whether H lets fields be even along the axis, with what is held at both ends at zero."""
+    if problem.whole.identified is not None and axis in problem.whole.identified.axes:
+        return True  # there are none
     low, high = _range(problem, axis)
     tiny, n, comm = 1e-9 * (high - low), problem.disc.n, problem.comm
     x, fixed = problem.whole.mesh.geometry.x[:, axis], problem.supports.fixed

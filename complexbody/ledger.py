@@ -15,13 +15,16 @@ the largest energy.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 
-from complexbody.errors import DivergenceError
+from complexbody import guards
+from complexbody.errors import DivergenceError, ResultsError
 from complexbody.integrators.entries import Entries, Run
+from complexbody.momentum import AngularMomentum, axes_of
 from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
@@ -41,14 +44,18 @@ class Ledger:
     ``ledger["stored"]`` is a column as an array. ``balance`` is the energy that came from nowhere
     since the start [J]; ``variation_u`` and ``variation_nu`` are pV of the rates,
     ∫ Σ_steps |q̇⁺ − q̇⁻|₁ dx (paper, Proposition 1, in the 1-norm over components), nan where an
-    integrator does not measure it.
+    integrator does not measure it. Bodies that say how ν turns have ``angular_momentum_3`` about
+    the origin (in 3D 1 to 3), with ν's share (:mod:`complexbody.momentum`).
     """
 
-    def __init__(self, displacement: int) -> None:
+    def __init__(self, displacement: int, axes: Sequence[int] = ()) -> None:
         self.columns = [*COLUMNS, *(f"momentum_{i + 1}" for i in range(displacement))]
+        self.columns += [f"angular_momentum_{axis + 1}" for axis in axes]
         self.rows: list[list[float]] = []
 
     def __getitem__(self, name: str) -> Array:
+        if name not in self.columns:
+            raise ResultsError(f"The ledger has no {name!r}. It has {', '.join(self.columns)}.")
         index = self.columns.index(name)
         return np.array([row[index] for row in self.rows])
 
@@ -57,7 +64,8 @@ class Ledger:
 
     def units(self) -> list[str]:
         """Unit of each column."""
-        return [COLUMNS.get(name, "N s") for name in self.columns]
+        rest = ("N m s" if name.startswith("angular") else "N s" for name in self.columns)
+        return [COLUMNS.get(name, unit) for name, unit in zip(self.columns, rest, strict=True)]
 
 
 class Bookkeeper:
@@ -68,21 +76,29 @@ class Bookkeeper:
         run: The run whose state is booked.
         growth: A run is stopped when the unexplained energy exceeds this multiple of what was put
             in; None lets it go on.
+
+    Attributes:
+        last_good: Time of the last row that no guard minded [s], None before the first.
     """
 
     def __init__(self, problem: Problem, run: Run, growth: float | None = 10.0) -> None:
         self.problem, self.run, self.growth = problem, run, growth
-        self.ledger = Ledger(problem.whole.displacement)
+        self._axes = list(axes_of(problem.whole))
+        self._angular = AngularMomentum(problem) if self._axes else None
+        self.ledger = Ledger(problem.whole.displacement, self._axes)
         self._start: float | None = None
         self._put = 0.0
         self._reference: float | None = None
         self._size = 1e-300
+        self._orientation = guards.Orientation(problem)
+        self.last_good: float | None = None
 
     def row(self) -> list[float]:
         """Book the state at the run's time and return the new row.
 
         Raises:
-            DivergenceError: for non-finite values or energy from nowhere (on all ranks).
+            DivergenceError: for non-finite values, energy from nowhere, or a cell turned inside
+                out, with its place and the time of the last good row (on all ranks).
         """
         run = self.run
         e = Entries.from_array(self.problem.comm.allreduce(run.entries().array()))
@@ -104,27 +120,68 @@ class Bookkeeper:
         record[:n_u] = e.momentum
         momentum = self.problem.spread(record)[: self.problem.whole.displacement]
         row += [e.variation_u, e.variation_nu, *momentum]
+        if self._angular is not None:
+            moments = self.problem.comm.allreduce(self._angular(*run.sample()))
+            row += moments[self._axes].tolist()
         self.ledger.rows.append([float(v) for v in row])
         self._guard(e.surplus - self._start if run.steps > 0 else 0.0)
         return self.ledger.rows[-1]
 
+    def state(self) -> dict[str, float | None]:
+        """What later rows depend on besides the run."""
+        return {name: getattr(self, f"_{name}") for name in ("start", "put", "reference", "size")}
+
+    def restore(self, state: Mapping[str, float | None], rows: Array) -> None:
+        """Go on from a state and the rows so far (rows, columns)."""
+        for name, value in state.items():
+            setattr(self, f"_{name}", value)
+        self.ledger.rows[:] = rows.tolist()
+
     def _guard(self, excess: float) -> None:
-        run = self.run
+        run, problem = self.run, self.problem
         # The last columns but momentum are pV, nan for integrators that do not measure it.
         measured = [v for v, c in zip(self.ledger.rows[-1], self.ledger.columns, strict=True)
                     if not c.startswith("variation")]  # fmt: skip
         if not np.isfinite(measured).all():
-            raise DivergenceError(
-                f"Values became non-finite by t = {run.time:.6g} s (step {run.steps}). The step "
-                f"{run.step:.3g} s is {run.step / run.critical:.3g} of the critical one: use a "
-                "smaller one, or check initial data and loads."
+            place = guards.lost_node(problem, run.positions(), problem.kernels.v)
+            began = f", most likely first at {place.name} of {place}" if place else ""
+            if place is None:  # what is squared overflows first
+                place = guards.fullest_cell(problem, run.positions())
+                began = f", largest in {place}" if place else ""
+            self._stop(
+                f"Values became non-finite by t = {run.time:.6g} s (step {run.steps}){began}. The "
+                f"step {run.step:.3g} s is {run.step / run.critical:.3g} of the critical one: use "
+                "a smaller one, or check initial data, loads and the energy there.",
+                place,
             )
         if self.growth is not None and abs(excess) > self.growth * self._bound():
-            raise DivergenceError(
-                f"Energy appeared from nowhere by t = {run.time:.6g} s: {excess:.3g} J, more than "
-                f"{self.growth:g} times what was put in. The step is {run.step / run.critical:.3g} "
-                "of the critical one: use a smaller one, or let it go on with growth=None."
+            place = guards.fullest_cell(problem, run.positions())
+            most = f"; {place.value:.0%} of the energy is in {place}" if place else ""
+            self._stop(
+                f"Energy appeared from nowhere by t = {run.time:.6g} s (step {run.steps}): "
+                f"{excess:.3g} J, more than {self.growth:g} times what was put in{most}. The step "
+                f"is {run.step / run.critical:.3g} of the critical one: use a smaller one, or let "
+                "it go on with growth=None.",
+                place,
             )
+        place = self._orientation.worst(run.positions())
+        if place is not None:
+            self._stop(
+                f"By t = {run.time:.6g} s (step {run.steps}) the body {place.name} has a cell "
+                f"turned inside out, det F = {place.value:.3g} in {place}. Use a smaller step or "
+                "load or a finer mesh there, or Body(orientation=False) if its energy is meant "
+                "for that.",
+                place,
+            )
+        self.last_good = run.time
+
+    def _stop(self, message: str, place: guards.Place | None) -> NoReturn:
+        good = self.last_good
+        well = "It was so at the start." if good is None else f"All was well at t = {good:.6g} s."
+        message = f"{message} {well}"
+        error = DivergenceError(message)
+        error.ledger, error.last_good, error.place = self.ledger, good, place
+        raise error
 
     def _bound(self) -> float:
         """What was ever put in: initial energies, works, and what stored and potential gave away.

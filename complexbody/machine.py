@@ -21,7 +21,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import complexbody
-from complexbody import native
+from complexbody import jitcache, native
 from complexbody.errors import MissingPackage
 from complexbody.rendering import require_vtk
 
@@ -132,7 +132,6 @@ def description() -> list[str]:
         compiler = ", ".join(native.compiler())
     except MissingPackage as missing:
         compiler = f"missing: {missing}"
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     entries = [
         *versions().items(),
         ("commit", commit() or "none (not run from a git repository)"),
@@ -141,7 +140,7 @@ def description() -> list[str]:
         ("cpu", f"{here['cpu']}, {here['cores']} cores, {here['lanes']} doubles per vector"),
         ("system", here["system"]),
         ("cache", _folder(native.cache_folder(), "kernel-*.so")),
-        ("ffcx cache", _folder(home / "fenics", "libffcx_*.so")),
+        ("ffcx cache", _folder(jitcache.folder(), "libffcx_*.so")),
     ]
     lines = [f"{name:12s} {value}" for name, value in entries]
     lines += ["", "Optional parts:"]

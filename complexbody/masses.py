@@ -1,28 +1,36 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 r"""Lumped masses, viscosities and supports of nodes, grouped into classes of equal nodes.
 
-Per unit of a node's lumped volume a node has a mass matrix M = diag(ρ, …, ρ, Ω), a viscosity
-D = diag(0, …, 0, η) and a set of prescribed components. Few combinations occur (regions times
-supports), so matrices are kept per class. Every dissipation scheme is then one recursion with an
-effective mass
+Per unit of a node's lumped volume a node has a mass matrix M = diag(ρ, …, ρ, Ω), a damping matrix
+D = diag(0, …, 0, η), to which absorbing boundaries add theirs in all components, and a set of
+prescribed components. Few combinations occur (regions times supports; nodes of an absorbing
+boundary are mostly their own), so matrices are kept per class. Every dissipation scheme is then one
+recursion with an effective mass
 
 .. math:: (\hat M + hD/2)\,v^+ = (\hat M - hD/2)\,v^- + h f,\qquad x \mathrel{+}= h v^+,
 
 v the *mean* rate of a drift: :math:`\hat M = M` ("symmetric"), :math:`M + hD/2` ("forward"),
 :math:`(hD/2)\coth(hD/(2M))` ("exact": the exact flow of ρ̄ν̈ + ην̇ = 0 between kicks; its limit
 M → 0 is hD/2, that of "forward"). Hence one stability criterion, 4M̂ − h²K ≻ 0, and one energy.
+A damper's hD/M is about one on any mesh, so that M̂ would not tend to M: those of absorbing
+boundaries are in D alone, "symmetric" in all schemes. They change no critical step.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import scipy.linalg
+import scipy.sparse.csgraph
 
 from complexbody.discretisation import Discretisation
 from complexbody.errors import IntegratorError
+
+if TYPE_CHECKING:
+    from complexbody.dampers import Dampers
 
 Array = npt.NDArray[np.float64]
 SCHEMES = ("exact", "symmetric", "forward")
@@ -49,6 +57,23 @@ def pencil_basis(mass: Array, viscosity: Array) -> tuple[Array, Array, Array]:
     d = np.einsum("ji,jk,ki->i", vectors, viscosity, vectors)
     # Round-off must not turn a missing inertia into a tiny one.
     return vectors, np.where(m > 1e-13 * a, m, 0.0), np.where(d > 1e-13 * b, d, 0.0)
+
+
+def damped_basis(mass: Array, damping: Array) -> tuple[Array, Array, Array]:
+    """The same of all components of a node, (n, n), whatever the units of u and ν.
+
+    Components that nothing couples stay apart; those coupled are taken in units of their own.
+    """
+    n, scale = len(mass), np.sqrt(np.where(np.diag(mass) > 0, np.diag(mass), np.diag(damping)))
+    V, m, d = np.zeros((n, n)), np.zeros(n), np.zeros(n)
+    linked = scipy.sparse.csr_matrix((mass != 0) | (damping != 0))
+    count, label = scipy.sparse.csgraph.connected_components(linked, directed=False)
+    for part in range(count):
+        at = np.flatnonzero(label == part)
+        ix, s = np.ix_(at, at), np.outer(scale[at], scale[at])
+        basis, m[at], d[at] = pencil_basis(mass[ix] / s, damping[ix] / s)
+        V[ix] = basis / scale[at][:, None]
+    return V, m, d
 
 
 def effective(m: Array, d: Array, h: float | Array, scheme: str) -> Array:
@@ -122,13 +147,18 @@ class Masses:
         stiffness: S per body (bodies, k, k): Ω + h²S/4 is then the inertia
             (:mod:`complexbody.stiffness`).
         step: That h [s], for all nodes or of each (nodes,).
+        dampers: Of absorbing boundaries (:mod:`complexbody.dampers`).
 
     Attributes:
         classes: Class of each node, shape (nodes + 1,), int32.
         density: ρ per class; inertia, viscosity: Ω, η per class (classes, k, k).
+        damping: D per class (classes, n, n), with dampers.
+        dampers: Classes whose damping is not η alone.
         fixed: Prescribed components per class (classes, n).
-        diagonal: True if no class couples components of ν by inertia or viscosity.
-        damped: True if there is any viscosity.
+        diagonal: True if no class couples components by inertia or damping.
+        only_dampers_couple: True if without dampers it would be.
+        whole: True if dampers couple components, those of u too.
+        damped: True if there is any damping; absorbing: if there are dampers. On any rank.
 
     Raises:
         BodyError: if a body's inertia is a function (explicit integrators cannot take it).
@@ -140,6 +170,7 @@ class Masses:
         fixed: npt.NDArray[np.bool_],
         stiffness: Array | None = None,
         step: float | Array = 0.0,
+        dampers: Dampers | None = None,
     ) -> None:
         bodies = disc.scene.bodies
         self.n, self.n_u = disc.n, disc.scene.displacement
@@ -155,7 +186,12 @@ class Masses:
         label = region.astype(np.int64)
         label[mixed] = len(bodies) + np.arange(len(mixed))
         bits = fixed @ (1 << np.arange(self.n, dtype=np.int64))
-        keys = np.stack([label, bits, rho.view(np.int64), h.view(np.int64)], axis=1)
+        columns = [label, bits, rho.view(np.int64), h.view(np.int64)]
+        self.absorbing = dampers is not None
+        if dampers is not None:
+            added = dampers.per_volume(disc)
+            columns += list(added.reshape(disc.nodes, -1).view(np.int64).T)
+        keys = np.stack(columns, axis=1)
         _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         self.classes = np.zeros(disc.nodes + 1, np.int32)
         self.classes[:-1] = inverse.ravel()
@@ -167,9 +203,16 @@ class Masses:
         self.inertia = np.einsum("cr,rij->cij", weight, omega)
         self.inertia += np.einsum("c,cr,rij->cij", h[first] ** 2, weight, extra)
         self.viscosity = np.einsum("cr,rij->cij", weight, eta)
-        self.damped = bool(np.any(eta))
+        self.damping, self.whole = self.full(self.viscosity), False
+        self.damped = bool(np.any(eta)) or self.absorbing
         off = ~np.eye(disc.scene.descriptor, dtype=bool)
         self.diagonal = not (np.any((omega + extra)[:, off]) or np.any(eta[:, off]))
+        self.only_dampers_couple = self.diagonal
+        if dampers is not None:
+            self.damping += added[first]
+            self.whole = dampers.coupled
+            self.diagonal &= not dampers.coupled
+        self.dampers = np.any(self.damping != self.full(self.viscosity), axis=(1, 2))
         self.pure = region[first] >= 0
         self._bases = [
             pencil_basis(o, e) for o, e in zip(self.inertia, self.viscosity, strict=True)
@@ -177,31 +220,35 @@ class Masses:
 
     @property
     def one_rate(self) -> bool:
-        """True if all components of a class that have a rate η/ρ̄ > 0 have the same, and inertia.
+        """True if all components of a class that have a rate D/M > 0 have the same, and inertia.
 
         Prescribed components have the rate 0: they move as they are told.
         """
-        m, d = (np.einsum("cii->ci", a) for a in (self.inertia, self.viscosity))
+        mass = self.full(self.inertia, self.density)
+        m, d = (np.einsum("cii->ci", a) for a in (mass, self.damping))
         if np.any(m == 0):
             return False
-        rate = np.where(self.fixed[:, self.n_u :], 0.0, d / m)
+        rate = np.where(self.fixed, 0.0, d / m)
         most = rate.max(axis=1, keepdims=True)
         return bool(np.all((rate == 0) | (np.abs(rate - most) <= 1e-14 * most)))
 
     def diagonalised(self) -> Diagonal:
         """Per class a basis of the free components in which inertia and viscosity are diagonal."""
         count = len(self.density)
-        mass, damping = self.full(self.inertia, self.density), self.full(self.viscosity)
+        mass, damping = self.full(self.inertia, self.density), self.damping
         vectors = np.tile(np.eye(self.n), (count, 1, 1))
         m, d = np.einsum("cii->ci", mass).copy(), np.einsum("cii->ci", damping).copy()
         if not self.diagonal:
-            for c, fixed in enumerate(self.fixed):
-                free = self.n_u + np.flatnonzero(~fixed[self.n_u :])
+            off = ~np.eye(self.n, dtype=bool)
+            coupled = np.any(mass[:, off], axis=1) | np.any(damping[:, off], axis=1)
+            for c in np.flatnonzero(coupled):
+                fixed = self.fixed[c]
+                start = 0 if self.dampers[c] else self.n_u
+                free = start + np.flatnonzero(~fixed[start:])
                 if free.size:
                     ix = np.ix_(free, free)
-                    vectors[c][ix], m[c, free], d[c, free] = pencil_basis(
-                        mass[c][ix], damping[c][ix]
-                    )
+                    basis = pencil_basis if start else damped_basis
+                    vectors[c][ix], m[c, free], d[c, free] = basis(mass[c][ix], damping[c][ix])
         return Diagonal(vectors, np.linalg.inv(vectors), m, d)
 
     def full(self, nu: Array, u: Array | None = None) -> Array:
@@ -235,7 +282,7 @@ class Masses:
         if scheme not in SCHEMES:
             raise IntegratorError(f"dissipation is {scheme!r}. Give one of {', '.join(SCHEMES)}.")
         mean = self.effective(h, scheme)
-        D, M = self.full(self.viscosity), self.full(self.inertia, self.density)
+        D, M = self.damping, self.full(self.inertia, self.density)
         plus, minus = mean + 0.5 * h * D, mean - 0.5 * h * D
         alpha, beta = np.zeros_like(M), np.zeros_like(M)
         to_rate, force_to_rate, massless, from_rate = (np.zeros_like(M) for _ in range(4))

@@ -17,6 +17,7 @@ import platform
 import shutil
 import subprocess
 import tempfile
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -88,29 +89,76 @@ def load(source: str, optimisation: str = OPTIMISATION) -> ctypes.CDLL:
 
     Raises:
         MissingPackage: if there is no C compiler.
-        ComplexBodyError: if the compiler fails, with its first messages.
+        ComplexBodyError: if the compiler fails, with its first messages, or there is no space.
     """
     path, version = compiler()
     flags = (optimisation, *FLAGS)
     key = "\n".join([source, *flags, version, platform.machine(), *sorted(cpu_flags())])
     digest = hashlib.sha256(key.encode()).hexdigest()[:24]
-    folder = _writable(cache_folder())
-    library = folder / f"kernel-{digest}.so"
-    if not library.exists():
-        _compile(path, source, optimisation, library)
-    return ctypes.CDLL(str(library))
+    library = writable(cache_folder()) / f"kernel-{digest}.so"
+    for _ in range(2):
+        try:
+            if not _is_whole(library):
+                _compile(path, source, optimisation, library)
+            return ctypes.CDLL(str(library))
+        except OSError as error:  # no space, or gone since
+            failure = error
+            library.unlink(missing_ok=True)
+    raise ComplexBodyError(
+        f"The kernel {library} cannot be made or loaded: {failure}. Check that its folder has free "
+        "space and may be written, or set COMPLEXBODY_CACHE to another one."
+    ) from failure
 
 
-def _writable(folder: Path) -> Path:
+def _is_whole(library: Path) -> bool:
+    """Whether a cached library ends with the digest of what is before: not cut short, not changed.
+
+    The loader would not notice: it maps the file, and the process dies of SIGBUS.
+    """
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    except OSError:
-        pass
-    # A read-only home (a cluster's compute node, say) must not stop a run.
+        content = library.read_bytes()
+    except FileNotFoundError:
+        return False
+    return hashlib.sha256(content[:-32]).digest() == content[-32:]
+
+
+@functools.cache
+def writable(folder: Path, name: str = "") -> Path:
+    """The folder's part ``name``, made if it is missing; or one in the temporary folder.
+
+    A read-only home (a cluster's compute node, say) must not stop a run: it is told, once.
+    """
+    for place in (folder / name, _temporary() / name):
+        with contextlib.suppress(OSError):
+            place.mkdir(parents=True, exist_ok=True)
+            if os.access(place, os.W_OK):
+                if place != folder / name:
+                    warnings.warn(
+                        f"The cache {folder / name} cannot be written, so {place} is used: "
+                        "kernels are compiled anew on each machine. Set COMPLEXBODY_CACHE to a "
+                        "folder that can.",
+                        UserWarning, stacklevel=2,
+                    )  # fmt: skip
+                return place
+    raise ComplexBodyError(
+        f"Neither the cache {folder / name} nor the temporary folder can be written. Set "
+        "COMPLEXBODY_CACHE to a folder that can."
+    )
+
+
+def _temporary() -> Path:
+    """A folder of the user's own in the temporary one, closed to others.
+
+    Raises:
+        ComplexBodyError: if it is somebody else's, who could put code there.
+    """
     fallback = Path(tempfile.gettempdir()) / f"complexbody-{os.getuid()}"
-    fallback.mkdir(mode=0o700, parents=True, exist_ok=True)
+    with contextlib.suppress(OSError):
+        fallback.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if fallback.exists() and fallback.stat().st_uid != os.getuid():
+        raise ComplexBodyError(
+            f"{fallback} is another user's. Set COMPLEXBODY_CACHE to a folder of your own."
+        )
     return fallback
 
 
@@ -128,6 +176,11 @@ def _compile(path: str, source: str, optimisation: str, library: Path) -> None:
                 f"The C compiler {path} failed on a generated kernel. Check that it works and that "
                 f"{library.parent} has free space; it said:\n{text}"
             )
+        with so_file.open("r+b") as file:
+            digest = hashlib.sha256(file.read()).digest()
+            file.write(digest)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(so_file, library)
 
 

@@ -62,7 +62,7 @@ def state_of(run: Run, problem: Problem) -> tuple[State, Entries]:
     energy = entries.kinetic_u + entries.kinetic_nu + entries.stored + entries.potential
     out = np.zeros((2, len(problem.scene.mesh.geometry.x), disc.n))
     for values, records in zip(out, run.sample(), strict=True):
-        values[disc.dof] = records[:-1, : disc.n]
+        disc.spread(records[:-1, : disc.n], values)
     return State(out[0], out[1], energy), entries
 
 

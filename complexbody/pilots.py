@@ -31,10 +31,10 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody.boundary import Loads
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import Constant
 from complexbody.integrators.entries import Run
+from complexbody.loading import Loads
 from complexbody.problem import Problem
 from complexbody.scene import Scene
 from complexbody.timesets import cell_densities
@@ -65,7 +65,7 @@ def moment_of(run: Run, problem: Problem, begin: float = 0.0) -> Moment:
     disc = problem.disc
     out = np.zeros((2, len(problem.scene.mesh.geometry.x), disc.n))
     for values, records in zip(out, run.sample(), strict=True):
-        values[disc.dof] = records[:-1, : disc.n]
+        disc.spread(records[:-1, : disc.n], values)
     return Moment(out[0], out[1], begin + run.time)
 
 
@@ -110,7 +110,10 @@ class Pilots:
         self.n_u = self.problem.scene.displacement
         masses, disc = self.problem.masses, self.problem.disc
         start = np.zeros((2, len(self.problem.scene.mesh.geometry.x), disc.n))
-        start[:, disc.dof] = self.problem.initial_fields, self.problem.initial_rates
+        for values, records in zip(
+            start, (self.problem.initial_fields, self.problem.initial_rates), strict=True
+        ):
+            disc.spread(records, values)
         self.start = Moment(start[0], start[1], 0.0)
         weight = disc.volume * disc.owned
         node = masses.full(masses.inertia, masses.density)[masses.classes[:-1]]
@@ -169,7 +172,7 @@ class Pilots:
         problem, disc, kernels = self.problem, self.problem.disc, self.problem.kernels
         masses, out = problem.masses, np.zeros(2)
         mass = masses.full(masses.inertia, masses.density)[masses.classes[:-1]]
-        eta = masses.full(masses.viscosity)[masses.classes[:-1]]
+        eta = masses.damping[masses.classes[:-1]]
         weight = disc.volume * disc.owned
         for i, columns in enumerate((slice(0, self.n_u), slice(self.n_u, disc.n))):
             s = np.zeros((disc.nodes, disc.n))

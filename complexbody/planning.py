@@ -162,6 +162,8 @@ def _exact(problem: Problem, method: Any) -> list[Finding]:
         Finding("inertia", "a general χ(ν, ν̇)", "a nonlinear solve per node and step") if general
         else Finding("inertia", "quadratic χ", "No solve: lumped masses are inverted once")
     )  # fmt: skip
+    if problem.whole.identified is not None:
+        out.append(_faces(problem))
     return [*out, _loads(problem)]
 
 
@@ -179,6 +181,16 @@ def _kernels(problem: Problem) -> Finding:
     why = "Straight-line code of the non-zeros" if generated else "FFCx's kernels, cell by cell"
     saves = "8 to 13 times against assembly by dolfinx" if generated else ""
     return Finding("energy", "; ".join(parts), why, saves)
+
+
+def _faces(problem: Problem) -> Finding:
+    found, disc = problem.whole.identified, problem.disc
+    assert found is not None
+    nodes, count = problem.comm.allreduce(int(disc.owned.sum())), len(found.number)
+    along = ", ".join(AXES[axis] for axis in found.axes)
+    what = f"along {along}" if found.boxed else "by given vectors"
+    return Finding("periodic", f"{what}: {count} of {nodes} nodes have copies",
+                   "All copies of a node share its record, mass and force")  # fmt: skip
 
 
 def _loads(problem: Problem) -> Finding:
@@ -209,7 +221,7 @@ def sizes(problem: Problem) -> tuple[float, float]:
     volume = disc.geometry[:, -1, :][disc.source_cell >= 0] ** 2
     parts = comm.allgather(volume)
     cell = float(np.median(np.concatenate(parts))) ** (1 / disc.dim)
-    x = disc.position[:-1, : disc.dim]
+    x = np.asarray(problem.scene.mesh.geometry.x)[:, : disc.dim]
     low = np.min(comm.allgather(x.min(axis=0, initial=np.inf)), axis=0)
     high = np.max(comm.allgather(x.max(axis=0, initial=-np.inf)), axis=0)
     return cell, float(np.max(high - low))

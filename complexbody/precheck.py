@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody import coercivity
+from complexbody import _compat, coercivity
 from complexbody.integrators.entries import Run
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.ledger import Bookkeeper
@@ -64,8 +64,10 @@ def limits(problem: Problem, dissipation: str) -> Limits:
     least, where = np.inf, (0.0,) * disc.dim
     if mine.size:
         block, lane = np.unravel_index(np.argmin(np.where(finite, steps, np.inf)), steps.shape)
-        corners = disc.position[disc.cells[block, :, lane], : disc.dim]
-        least, where = float(steps[block, lane]), tuple(corners.mean(axis=0).tolist())
+        mesh = problem.scene.mesh
+        nodes = _compat.cell_nodes(mesh)[disc.source_cell[block, lane]]
+        middle = np.asarray(mesh.geometry.x)[nodes, : disc.dim].mean(axis=0)
+        least, where = float(steps[block, lane]), tuple(middle.tolist())
     least, where = min(comm.allgather((least, where)))
     found: Limits | None = None
     if parts is not None:

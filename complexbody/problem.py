@@ -17,16 +17,19 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from complexbody import _compat, boundary, native
+from complexbody import _compat, boundary, loading, native
 from complexbody.action import Action
 from complexbody.assumptions import check_energy, hessian_samples
 from complexbody.body import Body
 from complexbody.convexity import Convexity, Range
+from complexbody.dampers import Dampers, dampers
 from complexbody.discretisation import Discretisation
+from complexbody.errors import BodyError, SceneError
 from complexbody.histories import shifted
 from complexbody.kernels.library import Kernels
 from complexbody.live import Live, live
 from complexbody.masses import Masses
+from complexbody.mirrors import check_mirrors
 from complexbody.reduction import reduced_data, reduced_scene
 from complexbody.scene import FIELDS, Scene
 from complexbody.stiffness import self_stiffness
@@ -46,6 +49,7 @@ class Problem:
         full: The problem of ``whole``, whose critical steps are those of the run, until released.
         supports, loads: In geometry nodes.
         self_stiffness: S per body of an implicit self-action (bodies, k, k); else zero.
+        dampers: Of absorbing boundaries, if there are any.
         node_step: h of its inertia Ω + h²S/4 [s], of all nodes or each (dolfinx's numbers).
         moving: (node, component) of supports that move, sorted by node; own numbering.
         load_position, load_group, load_value: Entries of load vectors in flat node records.
@@ -64,22 +68,29 @@ class Problem:
 
     disc: Discretisation
     self_stiffness: Array
+    dampers: Dampers | None
 
     def __init__(self, scene: Scene, reduce: bool = False) -> None:
         self.scene, self.whole, self.comm = scene, scene, scene.mesh.comm
         self.action = self.whole_action = Action(scene)
+        self.action.check_densities()
         dofs = _compat.cell_dofs(self.action.space)
         # All layers below rely on one numbering of nodes and P1 degrees of freedom.
         assert np.array_equal(dofs, _compat.cell_nodes(scene.mesh))
         self.supports = boundary.supports(scene, self.action)
-        self.loads = boundary.loads(scene, self.action)
+        self.loads = loading.loads(scene, self.action)
         self.start = boundary.initial(scene, self.action)
         self._read_inertia()
         self.node_step: float | Array = 0.0
         self.quiet = True
         self.known_steps: dict[str, Array] = {}
         self.arrange()
-        self.warnings = check_energy(self)
+        try:
+            self.warnings = check_energy(self)
+            check_mirrors(self)
+        except (BodyError, SceneError):  # which all ranks have: closing is collective
+            self.close()
+            raise
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
         self.full: Problem = self
         if reduce:
@@ -98,6 +109,8 @@ class Problem:
         nu = np.array([i for i in self.live.components if i >= self.whole.displacement], dtype=int)
         nu -= self.whole.displacement
         self.self_stiffness = full.self_stiffness[:, nu][:, :, nu]
+        if full.dampers is not None:
+            self.dampers = full.dampers.reduced(self.live.components)
         self.scene = reduced_scene(self.whole, self.live)
         self.action = Action(self.scene)
         self._read_inertia()
@@ -168,9 +181,10 @@ class Problem:
             self.self_stiffness = np.zeros((len(scene.bodies), scene.descriptor, scene.descriptor))
             if scene.self_action == "implicit":
                 self.self_stiffness = self_stiffness(scene, self.kernels.densities)
+            self.dampers = dampers(self)
         self.masses = self._stiffened()
         # Whatever integrator follows, kinetic energies are those of the whole Ω.
-        self.kernels.select(self.masses.diagonal, damped=False)
+        self.kernels.select(self.masses.diagonal, damped=False, whole=self.masses.whole)
         rows, columns = np.nonzero(moving[disc.dof])
         self.moving = rows.astype(np.int64), columns.astype(np.int32)
         self._lay_loads()
@@ -196,7 +210,7 @@ class Problem:
         if isinstance(step, np.ndarray):
             step = step[self.disc.dof]
         fixed = self.supports.fixed[self.disc.dof]
-        return Masses(self.disc, fixed, self.self_stiffness, step)
+        return Masses(self.disc, fixed, self.self_stiffness, step, self.dampers)
 
     def _initial(self, fields: Array, rates: Array, fixed: Any) -> None:
         disc, sup = self.disc, self.supports

@@ -16,8 +16,9 @@ import numpy.typing as npt
 import ufl
 
 from complexbody.body import Body
-from complexbody.boundary import Loads, Supports
+from complexbody.boundary import Supports
 from complexbody.live import Live
+from complexbody.loading import Loads
 from complexbody.scene import Initial, Scene
 
 Array = npt.NDArray[np.float64]
@@ -62,7 +63,7 @@ def reduced_body(body: Body, u: Sequence[int], nu: Sequence[int]) -> Body:
         # A general χ keeps all of ν (complexbody.live).
         body.inertia if callable(body.inertia) else body.inertia_matrix[ix],
         body.viscosity_matrix[ix], None if body.potential is None else outer, len(u),
-        body.quadrature_degree, body.name, body.constants,
+        body.quadrature_degree, body.name, body.constants, orientation=body.orientation,
     )  # fmt: skip
 
 
@@ -75,7 +76,7 @@ def reduced_scene(scene: Scene, live: Live) -> Scene:
     body: Body | dict[int, Body] = bodies[0]
     if not isinstance(scene.body, Body):
         body = dict(zip(sorted(scene.body), bodies, strict=True))
-    return replace(scene, body=body, supports=(), loads=(), initial=Initial())
+    return replace(scene, body=body, supports=(), loads=(), absorbing=(), initial=Initial())
 
 
 def reduced_data(

@@ -7,24 +7,26 @@ out which nodes a predicate selects, is the business of :mod:`complexbody.discre
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from complexbody import _compat
 from complexbody.body import Body
-from complexbody.errors import MeshError, SceneError, agree
+from complexbody.conditions import FIELDS, Absorb, PointSource, Symmetry, Value, Where, known_field
+from complexbody.errors import BodyError, MeshError, SceneError, agree
+from complexbody.given import is_whole, short
 from complexbody.histories import Constant, History
 from complexbody.kinetics import recognised
+from complexbody.periodicity import Identified, Periodic, checked, identify
 
-#: A facet tag, several of them, "boundary", or a predicate of x (3, npts) -> bool (npts,).
-Where = int | Sequence[int] | str | Callable[[Any], Any]
-#: A number, one number per component, or a callable of x (3, npts) -> (components, npts).
-Value = float | Sequence[float] | Callable[[Any], Any]
-
-FIELDS = ("u", "nu")
+__all__ = [
+    "FIELDS", "Absorb", "BodyForce", "Fix", "Initial", "PointSource", "Pressure", "Scene",
+    "Symmetry", "Traction", "Value", "Where",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Fix:
     history: History = Constant()
 
     def __post_init__(self) -> None:
-        _known_field("Fix", self.field)
+        known_field("Fix", self.field)
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class Traction:
     field: str = "u"
 
     def __post_init__(self) -> None:
-        _known_field("Traction", self.field)
+        known_field("Traction", self.field)
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ class BodyForce:
     field: str = "u"
 
     def __post_init__(self) -> None:
-        _known_field("BodyForce", self.field)
+        known_field("BodyForce", self.field)
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Initial:
     nu_dot: Value | None = None
 
 
-Load = Traction | Pressure | BodyForce
+Load = Traction | Pressure | BodyForce | PointSource
 
 
 @dataclass(frozen=True)
@@ -113,8 +115,10 @@ class Scene:
     Attributes:
         mesh: A dolfinx mesh of intervals, triangles or tetrahedra with straight cells.
         body: One :class:`Body`, or ``{cell tag: Body}`` together with ``cell_tags``.
-        supports: :class:`Fix` objects.
-        loads: :class:`Traction`, :class:`Pressure` and :class:`BodyForce` objects.
+        supports: :class:`Fix` and :class:`Symmetry` objects.
+        loads: :class:`Traction`, :class:`Pressure`, :class:`BodyForce` and :class:`PointSource`
+            objects.
+        absorbing: :class:`Absorb` objects: where waves leave the body.
         initial: Initial data; zero by default.
         cell_tags: dolfinx MeshTags of cells, needed where bodies or loads name cell tags.
         facet_tags: dolfinx MeshTags of facets, needed where supports or loads name facet tags.
@@ -122,6 +126,8 @@ class Scene:
             "lumped" by the vertex rule; "implicit" lumps it and steps over it where it is faster
             than waves across a cell (:mod:`complexbody.stiffness`).
         name: What to call it in tables and files.
+        periodic: Axes (0, 1, 2) along which opposite faces of a box are one, and
+            :class:`Periodic` pairs of other parts of the boundary.
 
     Raises:
         SceneError: if the parts do not fit together (on all ranks).
@@ -130,18 +136,22 @@ class Scene:
 
     mesh: Any
     body: Body | Mapping[int, Body]
-    supports: Sequence[Fix] = ()
+    supports: Sequence[Fix | Symmetry] = ()
     loads: Sequence[Load] = ()
     initial: Initial = field(default_factory=Initial)
     cell_tags: Any = None
     facet_tags: Any = None
     self_action: str = "consistent"
     name: str = "scene"
+    absorbing: Sequence[Absorb] = ()
+    periodic: Sequence[int | Periodic] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "supports", _several(self.supports, "supports", Fix))
+        object.__setattr__(self, "supports", _several(self.supports, "supports", Fix | Symmetry))
         object.__setattr__(self, "loads", _several(self.loads, "loads", Load))
+        object.__setattr__(self, "absorbing", _several(self.absorbing, "absorbing", Absorb))
         self._check_mesh()
+        object.__setattr__(self, "periodic", checked(self.periodic, self.mesh.geometry.dim))
         _compat.equispaced(self.mesh)
         self._check_tag_kinds()
         self._check_bodies()
@@ -149,9 +159,12 @@ class Scene:
         self._check_tags()
         if not isinstance(self.initial, Initial):
             raise SceneError("Scene: initial is not an Initial. Give initial=cb.Initial(u=…).")
-        if self.self_action not in ("consistent", "lumped", "implicit"):
+        if not isinstance(self.name, str):
+            raise SceneError(f"Scene: name is {short(self.name)}. Give a text.")
+        known = ("consistent", "lumped", "implicit")
+        if not isinstance(self.self_action, str) or self.self_action not in known:
             raise SceneError(
-                f"Scene: self_action is {self.self_action!r}. Give 'consistent', 'lumped' or "
+                f"Scene: self_action is {short(self.self_action)}. Give 'consistent', 'lumped' or "
                 "'implicit'."
             )
 
@@ -161,6 +174,15 @@ class Scene:
         if isinstance(self.body, Body):
             return (self.body,)
         return tuple(self.body[tag] for tag in sorted(self.body))
+
+    @cached_property
+    def identified(self) -> Identified | None:
+        """Which nodes are one, None without periodic faces; collective when first asked for.
+
+        Raises:
+            MeshError, SceneError: if faces do not match (on all ranks).
+        """
+        return identify(self.mesh, self.periodic, self.facet_tags) if self.periodic else None
 
     @property
     def lumped(self) -> bool:
@@ -222,6 +244,11 @@ class Scene:
             raise SceneError(
                 "Scene: body is neither a Body nor {cell tag: Body}. Give one of them."
             )
+        if not all(is_whole(tag) for tag in self.body):
+            raise SceneError(
+                f"Scene: a tag of body={{tag: …}} is no whole number: {short(list(self.body))}. "
+                "Give the tags of cell_tags."
+            )
         if not all(isinstance(body, Body) for body in self.body.values()):
             raise SceneError("Scene: a value of body={tag: …} is not a Body. Give Body objects.")
         shapes = {(body.displacement, body.descriptor) for body in self.bodies}
@@ -252,11 +279,19 @@ class Scene:
 
     def _recognise(self) -> None:
         """Give bodies whose χ(ν, ν̇) is ½ν̇·Ων̇ that Ω for their inertia."""
-        if isinstance(self.body, Body):
-            object.__setattr__(self, "body", recognised(self.body, self.mesh))
-        elif any(callable(body.inertia) for body in self.body.values()):
-            known = {tag: recognised(body, self.mesh) for tag, body in self.body.items()}
-            object.__setattr__(self, "body", known)
+        if not any(callable(body.inertia) for body in self.bodies):
+            return
+        known: Any = None
+        error: Exception | None = None
+        try:
+            if isinstance(self.body, Body):
+                known = recognised(self.body, self.mesh)
+            else:
+                known = {tag: recognised(body, self.mesh) for tag, body in self.body.items()}
+        except BodyError as found:
+            error = found
+        agree(self.mesh.comm, error)
+        object.__setattr__(self, "body", known)
 
     def _check_tag_kinds(self) -> None:
         cell = self.mesh.topology.dim
@@ -271,7 +306,10 @@ class Scene:
     def _check_tags(self) -> None:
         comm = self.mesh.comm
         error: Exception | None = None
-        for thing in (*self.supports, *self.loads):
+        pairs = [thing for thing in self.periodic if isinstance(thing, Periodic)]
+        for thing in (*self.supports, *self.loads, *self.absorbing, *pairs):
+            if isinstance(thing, PointSource):
+                continue
             where = thing.where
             cells = isinstance(thing, BodyForce)
             tags, kind = (self.cell_tags, "cell_tags") if cells else (self.facet_tags, "facet_tags")
@@ -297,11 +335,6 @@ class Scene:
                         f"{type(thing).__name__}: no entity has tag {tag} in {kind}. Check the tag."
                     )
         agree(comm, error)
-
-
-def _known_field(what: str, name: str) -> None:
-    if name not in FIELDS:
-        raise SceneError(f"{what}: field is {name!r}. Give 'u' or 'nu'.")
 
 
 def _several(given: Any, name: str, kind: Any) -> tuple[Any, ...]:

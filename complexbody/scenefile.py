@@ -20,8 +20,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from complexbody import _compat
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.scene import Scene
+from complexbody.together import Interrupted
 
 #: What ``DEFAULTS`` may have; the options of ``complexbody run`` go before it.
 SETTINGS = (
@@ -165,6 +167,7 @@ class SceneFile:
         Raises:
             CommandError: naming file, line and exception, or what it returned instead of a Scene.
         """
+        _compat.steady_partitions()  # a run that is resumed has the same parts
         with self._blamed("scene()"):
             made = self._function(comm, **parameters)  # type: ignore[misc]
         if not isinstance(made, Scene):
@@ -238,17 +241,26 @@ class SceneFile:
             yield
         except CheckFailed:
             raise
-        except (Exception, SystemExit) as error:
+        except (KeyboardInterrupt, Interrupted):
+            raise
+        except BaseException as error:  # sys.exit() and what a file derives from BaseException
             line, _ = self._line(error)
             place = f"{self.path}, line {line}" if line else str(self.path)
             place += f", in {doing}" if doing else ""
             if isinstance(error, ComplexBodyError):
                 raise type(error)(f"{error} ({place})") from error
-            what = error.msg if isinstance(error, SyntaxError) else str(error).split("\n")[0]
+            what = error.msg if isinstance(error, SyntaxError) else _text(error).split("\n")[0]
             raise CommandError(
                 f"{place}: {type(error).__name__}: {what}. Correct the scene file; --debug shows "
                 "the whole traceback."
             ) from error
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:  # of an exception of the file's own
+        return "its text cannot be had"
 
 
 def _a(thing: Any) -> str:

@@ -17,6 +17,7 @@ from mpi4py import MPI
 
 from complexbody import _compat, native
 from complexbody.errors import IntegratorError, StepError
+from complexbody.guards import cell_place, lowest
 from complexbody.kernels.ffcx import Tabulated
 from complexbody.kernels.pencil import matrix_eigenvalues, quadratic_eigenvalues
 from complexbody.masses import Masses, effective, pencil_basis
@@ -227,10 +228,13 @@ def _cell_steps(problem: Problem, scheme: str) -> Array:
         region = _Region(problem, r, rho[blocks])
         out[blocks] = region.steps(scheme)
     out[disc.source_cell < 0] = np.inf
-    bad = problem.comm.allreduce(bool(np.any(np.isnan(out))), op=MPI.LOR)
-    if bad:
+    bad = np.argwhere(np.isnan(out))
+    found = cell_place(problem, int(bad[0, 0]), int(bad[0, 1]), np.nan) if len(bad) else None
+    place = lowest(problem.comm, found)
+    if place is not None:
         raise StepError(
-            "The stiffness of a cell is not finite at the initial state. Check the energy there."
+            f"The stiffness of {place.name} is not finite at the initial state in {place}. Check "
+            "the energy and the initial data there."
         )
     if len(problem.scene.bodies) > 1 and problem.masses.damped and scheme == "exact":
         out *= _shared_step(problem, float(np.min(out, initial=np.inf)), scheme)
@@ -268,7 +272,8 @@ def _shared_mass(problem: Problem, h: float, scheme: str) -> float:
     weight = disc.region_volume[node] / disc.volume[node, None]
     total = np.einsum("cr,rij->cij", weight, np.array(parts))
     if np.any(problem.self_stiffness):
-        masses = Masses(disc, masses.fixed[masses.classes[:-1]], problem.self_stiffness, h)
+        fixed = masses.fixed[masses.classes[:-1]]
+        masses = Masses(disc, fixed, problem.self_stiffness, h, problem.dampers)
     whole = masses.effective(h, scheme)[mixed, masses.n_u :, masses.n_u :]
     ratios = np.linalg.eigvals(np.linalg.solve(total, whole)).real
     return float(problem.comm.allreduce(float(ratios.min(initial=1.0)), op=MPI.MIN))

@@ -112,7 +112,7 @@ def chart(
     """Measure cost and errors of methods on a scene; collective.
 
     Args:
-        scene: A scene, or a function (comm, **parameters) that makes it.
+        scene: A scene, or a function ``(comm, **parameters)`` that makes it.
         until: End of the runs [s].
         methods: Keys of :func:`complexbody.contenders.contenders`, or contenders; all by default.
         steps: How many steps each method makes, from its stable limit down (4), or the factors of

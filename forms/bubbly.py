@@ -173,6 +173,7 @@ def bubbly_liquid(
         displacement=d,
         name=name,
         constants=constants,
+        parity="even",
     )
 
 

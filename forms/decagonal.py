@@ -129,4 +129,6 @@ def decagonal_quasicrystal(
     remedy = f"Choose |R| < {math.sqrt(M * (K1 + K2) / 2):.9g}, or a larger K1 + K2."
     require(family, "(C11 - C12)/2*(K1 + K2) > 2*R**2", M * (K1 + K2), 2 * R**2, remedy)
     energy = _energy(**constants)
-    return Body(2, energy, density, inertia, viscosity, name=name, constants=constants)
+    return Body(
+        2, energy, density, inertia, viscosity, name=name, constants=constants, parity="polar"
+    )

@@ -124,7 +124,10 @@ def icosahedral_quasicrystal(
     remedy = f"Choose |R| < {math.sqrt(mu * k5 / 3):.9g}, or a larger mu or k5."
     require(family, "mu*k5 > 3*R**2", mu * k5, 3 * R**2, remedy)
     energy = _energy(**constants)
-    return Body(3, energy, density, inertia, viscosity, name=name, constants=constants)
+    # The mirrors of two-fold axes have whole entries: √5 → −√5 leaves them as they are.
+    return Body(
+        3, energy, density, inertia, viscosity, name=name, constants=constants, parity="polar"
+    )
 
 
 def scaled_icosahedral_quasicrystal(coupling: float = 0.5, viscosity: float = 0.5) -> Body:

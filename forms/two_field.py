@@ -137,5 +137,6 @@ def isotropic_two_field(
     constants = admissible(family, d, {"lam": lam, "mu": mu, **descriptor})
     energy = _energy(d, **constants)
     return Body(
-        d, energy, density, inertia, viscosity, displacement=d, name=name, constants=constants
-    )
+        d, energy, density, inertia, viscosity, displacement=d, name=name, constants=constants,
+        parity="polar",
+    )  # fmt: skip

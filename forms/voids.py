@@ -69,5 +69,6 @@ def elastic_voids(
         return own + void + b * nu[0] * trace
 
     return Body(
-        1, energy, density, inertia, viscosity, displacement=d, name=name, constants=constants
-    )
+        1, energy, density, inertia, viscosity, displacement=d, name=name, constants=constants,
+        parity="even",
+    )  # fmt: skip

@@ -9,7 +9,7 @@ from harness import everywhere, refused, wavy
 from mpi4py import MPI
 
 import complexbody as cb
-from complexbody import _compat, boundary
+from complexbody import _compat, boundary, loading
 from complexbody.action import Action
 from complexbody.errors import SceneError
 
@@ -67,7 +67,7 @@ def supports(mesh, *fixes, tags=None):
 
 def loads(mesh, *given, tags=None, cells=None, body=BODY):
     scene = cb.Scene(mesh, body, loads=given, facet_tags=tags, cell_tags=cells)
-    return boundary.loads(scene, Action(scene))
+    return loading.loads(scene, Action(scene))
 
 
 def total(mesh, found, components=5, times=(0.0,)):
@@ -187,7 +187,7 @@ def test_supports_that_overlap(comm):
 
 def _on_last_rank(comm, function):
     """A callable that works but on the last rank, where it calls ``function``."""
-    return lambda x: function(x) if comm.rank == comm.size - 1 else np.zeros(x.shape[1])
+    return lambda x: function(x) if comm.rank == comm.size - 1 else np.zeros(x.shape[1], bool)
 
 
 def _fail(x):
@@ -198,7 +198,11 @@ def _fail(x):
     "fix, words",
     [
         (lambda c: cb.Fix("u", lambda x: x[0] < -5.0), ("Fix('u'", "selects no node")),
-        (lambda c: cb.Fix("nu", lambda x: x[0]), ()),  # truth values of any type are fine
+        (lambda c: cb.Fix("nu", lambda x: 1 * (x[0] > -9.0)), ()),  # 0 and 1 are fine
+        (
+            lambda c: cb.Fix("nu", _on_last_rank(c, lambda x: x[0])),
+            ("Fix('nu')", "float64, no truth values"),
+        ),
         (
             lambda c: cb.Fix("nu", lambda x: np.zeros((2, 2), bool)),
             ("Fix('nu')", "predicate", "(2, 2)"),
@@ -366,7 +370,7 @@ def test_forces_do_not_depend_on_the_ranks(comm):
         (lambda c: cb.Traction("boundary", (0, 0, 1), field="nu"), ("Traction", "2 finite")),
         (lambda c: cb.BodyForce("down"), ("BodyForce", "vector")),
         (lambda c: cb.Pressure("boundary", np.nan), ("Pressure", "nan", "finite")),
-        (lambda c: cb.Pressure("boundary", "high"), ("Pressure", "ValueError")),
+        (lambda c: cb.Pressure("boundary", "high"), ("Pressure", "'high'", "finite")),
         (
             lambda c: cb.BodyForce(_on_last_rank(c, _fail), field="nu"),
             ("BodyForce", "vector", "RuntimeError: no such luck"),

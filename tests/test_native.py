@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """Compiled once per content, safe when many ask at once, clear when it cannot work."""
 
+import contextlib
 import ctypes
 import multiprocessing
 import os
+import signal
+import subprocess
+import sys
 import tempfile
 import time
 
@@ -108,6 +112,61 @@ def test_ranks_that_ask_at_once(comm, shared_path, monkeypatch):
     comm.barrier()
 
 
+@pytest.mark.parametrize("keep", [0, 40, 1000, 0.5, -1, "flip"])
+def test_damaged_libraries_are_compiled_anew(cache, keep):
+    """Cut short anywhere, or a bit changed: never loaded, for the loader would crash."""
+    load(source(20))
+    (library,) = cache.iterdir()
+    content = library.read_bytes()
+    if keep == "flip":
+        middle = len(content) // 2
+        damaged = content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+    else:
+        damaged = content[: int(keep * len(content)) if isinstance(keep, float) else keep]
+    library.unlink()  # this process has the old one mapped
+    library.write_bytes(damaged)
+    assert load(source(20)).answer() == 20
+    assert native._is_whole(library) and len(list(cache.iterdir())) == 1
+
+
+def test_no_space_for_kernels(cache, monkeypatch):
+    """The compiler's scratch folder cannot be made: told with the cache's name."""
+
+    def full(*arguments, **options):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "TemporaryDirectory", full)
+    with refused(ComplexBodyError, "No space left on device", str(cache), "COMPLEXBODY_CACHE"):
+        load(source(21))
+
+
+@pytest.mark.serial
+def test_a_killed_compile_leaves_nothing_that_is_taken(tmp_path):
+    """A process killed while the compiler runs: the next one compiles, and has the answer."""
+    slow = tmp_path / "cc"
+    slow.write_text(
+        '#!/bin/sh\ncase "$1" in --version) echo slow;; *) echo $$ >'
+        f" {tmp_path}/started; sleep 60;; esac\n"
+    )
+    slow.chmod(0o755)
+    text = f"from complexbody import native; native.load({source(22)!r})"
+    environment = dict(os.environ, COMPLEXBODY_CACHE=str(tmp_path / "cache"), CC=str(slow))
+    child = subprocess.Popen([sys.executable, "-c", text], env=environment)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "started").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    child.kill()
+    child.wait(10)
+    with contextlib.suppress(ValueError, ProcessLookupError):
+        os.kill(int((tmp_path / "started").read_text()), signal.SIGKILL)
+    environment.pop("CC")
+    done = subprocess.run(
+        [sys.executable, "-c", f"{text}; print(native.load({source(22)!r}).answer())"],
+        env=environment, capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+    assert done.stdout == "22\n", done.stderr
+
+
 @pytest.mark.parametrize("name", ["no-such-cc", "/nowhere/gcc -m64"])
 def test_no_compiler(cache, monkeypatch, name):
     """What is missing and how to get it; nothing is written."""
@@ -142,7 +201,8 @@ def test_cache_that_cannot_be_written(monkeypatch, tmp_path):
     (tmp_path / "tmp").mkdir()
     monkeypatch.setenv("COMPLEXBODY_CACHE", str(tmp_path / "file" / "cache"))
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "tmp"))
-    assert load(source(8)).answer() == 8
+    with pytest.warns(UserWarning, match="cannot be written.*Set COMPLEXBODY_CACHE"):
+        assert load(source(8)).answer() == 8
     (folder,) = (tmp_path / "tmp").iterdir()
     assert folder.name == f"complexbody-{os.getuid()}"
     assert folder.stat().st_mode & 0o077 == 0

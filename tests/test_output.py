@@ -62,7 +62,8 @@ def test_nodal_fields_are_read_back(comm, shared_path, dim, n_u, k):
 def test_files_do_not_depend_on_ranks(comm, shared_path, dim):
     """Every number is where a serial run puts it."""
     h5py = pytest.importorskip("h5py")
-    names = (*NODE_FIELDS, *CELL_FIELDS)
+    # det F of these fields comes near zero: those divided by it are in test_derived.py.
+    names = (*NODE_FIELDS, *(n for n in CELL_FIELDS if not n.startswith(("cauchy", "actual"))))
     for ranks, folder in ((comm, "all"), (MPI.COMM_SELF, f"alone-{comm.rank}")):
         scene = Scene(domain(ranks, dim), body())
         with Writer(Action(scene), Output(shared_path / folder, fields=names)) as writer:
@@ -88,7 +89,8 @@ def test_stress_of_an_affine_displacement(comm, shared_path, dim):
     def affine(x, i):
         return gradient[i % 5] @ x[:dim] + i
 
-    with Writer(Action(scene), Output(shared_path, fields=tuple(CELL_FIELDS))) as writer:
+    names = ("stress", "self_action", "microstress", "energy_density")
+    with Writer(Action(scene), Output(shared_path, fields=names)) as writer:
         writer.write(0.0, fields(scene, affine))
     comm.barrier()
     if comm.rank > 0:
@@ -97,7 +99,7 @@ def test_stress_of_an_affine_displacement(comm, shared_path, dim):
     U[:, :dim], N[:, :dim] = gradient[:3], gradient[3:]
     e = (U + U.T) / 2
     P = LAM * np.trace(e) * np.eye(3) + 2 * MU * e
-    found = {name: read(shared_path / f"{name}.xdmf") for name in CELL_FIELDS}
+    found = {name: read(shared_path / f"{name}.xdmf") for name in names}
     points, cells, _ = found["stress"]
     nu = np.array([affine(points[cells].mean(axis=1).T, i) for i in (3, 4)]).T
     elastic = 0.5 * (P * U).sum() + 0.5 * K1 * (N * N).sum()
@@ -107,10 +109,10 @@ def test_stress_of_an_affine_displacement(comm, shared_path, dim):
         "microstress": np.tile(np.append(K1 * N.ravel(), [0, 0, 0]), (len(cells), 1)),
         "energy_density": elastic + 0.5 * K0 * (nu**2).sum(axis=1, keepdims=True),
     }
-    kinds = dict(zip(CELL_FIELDS, ("Tensor", "Vector", "Tensor", "Scalar"), strict=True))
-    for name, symbol in CELL_FIELDS.items():
+    kinds = dict(zip(names, ("Tensor", "Vector", "Tensor", "Scalar"), strict=True))
+    for name in names:
         [(_, stored, values)] = found[name][2]
-        assert stored == symbol
+        assert stored == CELL_FIELDS[name]
         np.testing.assert_allclose(values, expected[name], atol=1e-12)
         text = (shared_path / f"{name}.xdmf").read_text()
         assert f'AttributeType="{kinds[name]}" Center="Cell"' in text

@@ -49,11 +49,26 @@ class Counted:
     skipped: int = 0
     activity: Activity | None = None
 
+    def wake(self) -> None:
+        """All cells act from now on: for who changes the state by hand."""
+        if self.activity is not None:
+            self.activity.stop()
+
     def _count(self, due: int) -> None:
         """Of so many cell updates that were due, count those done and those skipped."""
         saved = 0 if self.activity is None else self.activity.skipped - self.skipped
         self.skipped += saved
         self.updates += due - saved
+
+    def _counts(self) -> Ints:
+        """What a snapshot keeps of the counters."""
+        return np.array([self.updates, self.skipped])
+
+    def _recount(self, counts: npt.NDArray[Any]) -> None:
+        """Go on from these counters."""
+        self.updates, self.skipped = (int(c) for c in counts)
+        if self.activity is not None:
+            self.activity.state.skipped = self.skipped
 
 
 class Activity:
@@ -103,7 +118,7 @@ class Activity:
         c.cb_wake(this, ctypes.c_int64(len(rows)), native.pointer(rows))
 
     def stop(self) -> None:
-        """All cells act from now on: for who changes a run's state by hand."""
+        """All cells act from now on."""
         self.state.on = 0
 
     @property

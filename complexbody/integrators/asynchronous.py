@@ -17,11 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from complexbody.errors import IntegratorError, StepError, agree
+from complexbody.given import is_positive, short
 from complexbody.integrators.exact_run import ExactRun
-from complexbody.integrators.exact_schedule import span_length
+from complexbody.integrators.exact_schedule import alike, span_length
+from complexbody.integrators.options import flags, one_of
 from complexbody.integrators.stiffened import reach, stiffen
 from complexbody.integrators.window_run import WindowRun
-from complexbody.integrators.windows import divisions, graded, window_length
+from complexbody.integrators.windows import apart, divisions, graded, window_length
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
 from complexbody.timesets import cell_steps, require_constant_inertia
@@ -42,7 +44,8 @@ class AVI:
             0.47 of it on bars of two rates, hence 0.45.
         schedule: "octaves" (N_K = ⌈W/h_K⌉ equal steps per window rounded up to a power of two, and
             until neighbours differ by two at most; the default), "windows" (N_K as it is; the
-            default if not balanced) or "exact" (any real h_K, events at its multiples).
+            default if not balanced) or "exact" (any real h_K, events at its multiples; those not
+            given have 26 binary digits, so that cells alike but for round-off act together).
         balanced: Forces act through the cells' steps, which removes the error floor of asynchronous
             stepping; the default on octaves, and only there. False gives an AVI of the paper with
             rational time sets, symplectic, with the floor. An exact schedule is plain.
@@ -74,8 +77,10 @@ class AVI:
     inertia: ClassVar[str] = "number or k×k matrix; 0 where viscosity is positive"
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.safety) and 0 < self.safety):
-            raise StepError(f"AVI: safety is {self.safety}. Give a positive number, 0.45 or less.")
+        if not is_positive(self.safety):
+            raise StepError(
+                f"AVI: safety is {short(self.safety)}. Give a positive number, 0.45 or less."
+            )
         if self.schedule is None:
             plain = self.balanced is False or self.start == "one-sided"
             object.__setattr__(self, "schedule", "windows" if plain else "octaves")
@@ -84,11 +89,9 @@ class AVI:
             ("schedule", SCHEDULES),
             ("start", STARTS),
         ):
-            if getattr(self, name) not in allowed:
-                raise IntegratorError(
-                    f"AVI: {name}={getattr(self, name)!r} is not known. Give one of "
-                    f"{', '.join(allowed)}."
-                )
+            one_of(self, name, allowed)
+        flags(self, "unstable_ok", *(n for n in ("balanced", "corrected")
+                                     if getattr(self, n) is not None))  # fmt: skip
         exact, whole = self.schedule == "exact", self.start == "one-sided"
         octaves = self.schedule == "octaves"
         if self.balanced is None:
@@ -158,6 +161,8 @@ class AVI:
         own = np.full(disc.count, np.inf)
         own[disc.source_cell[real]] = critical[real]
         steps = self.safety * own
+        if self.schedule == "exact":
+            steps = alike(steps)
         if self.steps is not None:
             steps = self._given(problem, own)
         window = window_length(steps, until, problem.comm)
@@ -169,7 +174,8 @@ class AVI:
             return ExactRun(problem, self, span_length(blocks, until, problem.comm), blocks, own)
         octaves = self.schedule == "octaves"
         counts = divisions(steps, window, octaves)
-        problem.arrange(graded(problem, counts) if octaves else counts)
+        counts = graded(problem, counts) if octaves else counts
+        problem.arrange(apart(problem, counts) if self.balanced else counts)
         return WindowRun(problem, self, window, own)
 
     def _given(self, problem: Problem, critical: Array) -> Array:

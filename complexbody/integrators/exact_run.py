@@ -16,8 +16,11 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import native
+from complexbody.integrators.activity import ENOUGH, active
 from complexbody.integrators.exact_schedule import ExactSchedule
+from complexbody.integrators.reached import Reached
 from complexbody.integrators.records import RecordRun, World
+from complexbody.integrators.snapshot import Snapshot, to_blocks, to_cells
 from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.problem import Problem
 
@@ -33,6 +36,7 @@ class ExactRun(RecordRun):
     Attributes:
         steps_of: h_K of this rank's cells in blocks (blocks, W) [s], infinite for padding.
         schedule: Events of the span in progress, and messages.
+        reached: Which cells are quiet; None if that is not watched for.
     """
 
     def __init__(self, problem: Problem, method: AVI, span: float, steps: Array, critical: Array):
@@ -53,7 +57,52 @@ class ExactRun(RecordRun):
         self._seen.late, self._seen.beyond = disc.late, disc.late + disc.shared
         self._rows = np.arange(disc.shared, dtype=np.int32)
         self._touched = self._touched_nodes()
-        self._sampled: tuple[int, float] | None = None
+        self._sampled = False
+        self.reached: Reached | None = None
+        self._passed = 0  # events left out that ``reached`` does not know of
+        self._watch()
+
+    def _watch(self) -> None:
+        """Schedule only what motion can reach, if that is not nearly all; between spans."""
+        problem, disc = self.problem, self.problem.disc
+        self.reached = None
+        if not problem.quiet:
+            return
+        moving = (problem.initial_rates != 0).any(axis=1) & (self.steps == 0)
+        for first in (0, disc.record):  # positions, rates
+            moving |= (self.record[:-1, first : first + disc.n] != 0).any(axis=1)
+        moving[self._touched] = True
+        force, _ = problem.kernels.restless()
+        restless = np.repeat(force, np.diff(disc.chunks[:, :2], axis=1).ravel())
+        node = np.unique(disc.cells[restless])
+        moving[node[node < disc.nodes]] = True
+        enough = active(disc.cells, moving) > ENOUGH
+        if not problem.comm.allreduce(enough, op=MPI.LAND):
+            self.reached = Reached(problem, self.c, self.schedule, moving, self.time)
+
+    def wake(self) -> None:
+        """All cells act from now on."""
+        if self.reached is not None:
+            self.reached.stop()
+
+    def snapshot(self) -> Snapshot:
+        """The run between two spans, with its cells' counters."""
+        saved = super().snapshot()
+        counters = self.schedule.counters()
+        if self.reached is not None and self.reached.on:
+            counters = self.reached.counters(counters, self.steps_of, self.time)
+        saved.cells["counter"] = to_cells(self.problem.disc, counters)
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.schedule.set(to_blocks(self.problem.disc, saved.cells["counter"]))
+        self._sampled = False
+        self._watch()
+
+    def _recount(self, counts: npt.NDArray[np.int64]) -> None:
+        super()._recount(counts)
+        if self.reached is not None:
+            self._passed = self.skipped - self.reached.skipped(self.time)
 
     def _touched_nodes(self) -> npt.NDArray[np.int32]:
         """Nodes that loads or moving supports act on, on any rank."""
@@ -76,21 +125,25 @@ class ExactRun(RecordRun):
         for _ in range(spans):
             start, end = self.time, (self.steps + 1) * self.step
             self._touch(start)
+            if self.reached is not None and self.reached.on:
+                self.reached.follow(start, end)
             self._move_supports(start)
             self._load_kick(start, 0.5 if trapezoidal else 1.0)
-            self._count(self.schedule.run(self.c, self._world, start, end))
+            self.updates += self.schedule.run(self.c, self._world, start, end)
             self._touch(end)
             if trapezoidal:
                 self._load_kick(end)
             self.steps += 1
-            self._sampled = None
+            self._sampled = False
             self._book_supports(end)
+        if self.reached is not None:
+            self.skipped = self._passed + self.reached.skipped(self.time)
 
     def _see(self) -> None:
         """Bring the copy of the records to the last span's end, unless it is there."""
-        if self._sampled is not None:
+        if self._sampled:
             return
-        t, before = ctypes.c_double(self.time), float(self.sums[0])
+        t = ctypes.c_double(self.time)
         disc, seen = self.problem.disc, ctypes.byref(self._seen)
         np.copyto(self._copy, self.record)
         self.c.cb_drift(seen, t)
@@ -99,8 +152,7 @@ class ExactRun(RecordRun):
             message = self._message(self._rows)
             message.begin()
             message.end(self.time, seen)
-        self._sampled = (self.steps, float(self.sums[0]))
-        self.sums[0] = before
+        self._sampled = True
 
     def sample(self) -> tuple[Array, Array]:
         """(u, ν) and rates at the last span's end, node records (nodes + 1, NR)."""
@@ -120,5 +172,8 @@ class ExactRun(RecordRun):
     def dissipated(self) -> float:
         """Work of the viscosity up to the last span's end, this rank's share [J]."""
         self._see()
-        assert self._sampled is not None
-        return self._sampled[1]
+        if not self.losing:
+            return 0.0
+        disc, first = self.problem.disc, 2 * self.problem.disc.record
+        # A snapshot gives all copies of a node what its owner knows.
+        return float(np.sum(self._copy[:-1, first : first + disc.n][disc.owned]))

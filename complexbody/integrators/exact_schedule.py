@@ -27,6 +27,18 @@ _TAG = 8
 #: and little is lost in going through all cells for it.
 EVENTS, PER_CELL = 50_000, 1.0
 
+#: Binary digits of a step that is not given.
+DIGITS = 26
+
+
+def alike(steps: Array) -> Array:
+    """h_K rounded to so many binary digits that cells alike but for round-off act together [s].
+
+    Else motion, if ever so little, would run through all of them within one step.
+    """
+    digits, exponent = np.frexp(steps)
+    return np.asarray(np.ldexp(np.round(np.ldexp(digits, DIGITS)), exponent - DIGITS))
+
 
 def span_length(steps: Array, until: float, comm: Any) -> float:
     """Length of a span [s], at most the largest step; ``until`` ends one.
@@ -86,6 +98,7 @@ class ExactSchedule:
     def __init__(self, problem: Problem, steps: Array, span: float, trapezoidal: bool) -> None:
         disc = problem.disc
         self.halo, self.comm, self.n = disc.halo, problem.comm, disc.n
+        self._blocks = disc.source_cell.shape
         cells = disc.blocks * disc.lanes
         original = _compat.original_cells(problem.scene.mesh)
         source = disc.source_cell.ravel()
@@ -237,6 +250,25 @@ class ExactSchedule:
         """Let all cells act at t = 0 again."""
         self.counter[:] = 0
         self.arrays["due"][:] = np.where(np.isfinite(self.arrays["step"]), 0.0, np.inf)
+
+    def counters(self) -> Ints:
+        """j of the next event of this rank's cells, in blocks (blocks, W)."""
+        cells = self.counter[self._index[: self.state.cells]]
+        return cells.reshape(self._blocks)
+
+    def set(self, counters: Ints) -> None:
+        """Let cells go on with these events (blocks, W), on all ranks; collective."""
+        cells, own = self.state.cells, counters.ravel()
+        self.counter[self._index[:cells]] = own
+        told: list[Ints] = [np.zeros(0, np.int64) for _ in range(self.comm.size)]
+        for rank, (cell, _) in zip(self.halo.neighbours, self._touches, strict=True):
+            told[rank] = own[cell]
+        heard = self.comm.alltoall(told) if self.comm.size > 1 else []
+        visits = [heard[rank] for rank in self.halo.neighbours]
+        self.counter[self._index[cells:]] = np.concatenate([*visits, np.zeros(0, np.int64)])
+        step = self.arrays["step"]
+        with np.errstate(invalid="ignore"):
+            self.arrays["due"][:] = np.where(np.isfinite(step), self.counter * step, np.inf)
 
     # --- a span ------------------------------------------------------------------------------
 

@@ -233,3 +233,5 @@ class GlobalNewton:
         """Free PETSc's objects."""
         for thing in (self.snes, self.matrix, self._residual, self.vector):
             thing.destroy()
+        if hasattr(self, "_buffer"):
+            _compat.free_vector(self._buffer)

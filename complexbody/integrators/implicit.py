@@ -16,11 +16,15 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
+from complexbody.dampers import refuse_dampers
 from complexbody.errors import IntegratorError, StepError
+from complexbody.given import is_whole
 from complexbody.integrators.implicit_run import ImplicitRun
+from complexbody.integrators.options import flags, one_of, petsc_options, positive
 from complexbody.integrators.split_run import SplitRun
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
+from complexbody.periodicity import require_unrepeated
 from complexbody.problem import Problem
 from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import HELD, critical_step, require_constant_inertia
@@ -88,28 +92,22 @@ class Implicit:
     )
 
     def __post_init__(self) -> None:
-        for name, allowed in (
-            ("order", (1, 2)), ("quadrature", ("vertex", "consistent")),
-            ("solve", ("needed", "always")), ("forces", ("explicit", "implicit")),
-        ):  # fmt: skip
-            if getattr(self, name) not in allowed:
-                raise IntegratorError(
-                    f"Implicit: {name}={getattr(self, name)!r} is not known. Give one of "
-                    f"{', '.join(map(str, allowed))}."
-                )
-        for name in ("step", "safety", "tolerance", "iterations"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise StepError(f"Implicit: {name} is {value}. Give a positive number.")
+        one_of(self, "order", (1, 2))
+        one_of(self, "quadrature", ("vertex", "consistent"))
+        one_of(self, "solve", ("needed", "always"))
+        one_of(self, "forces", ("explicit", "implicit"))
+        positive(self, "step", "safety", "tolerance", "iterations")
+        if not is_whole(self.iterations):
+            raise StepError(f"Implicit: iterations is {self.iterations}. Give a whole number.")
+        flags(self, "monitor", "unstable_ok")
+        petsc_options(self)
         if self.forces == "implicit" and self.quadrature == "consistent":
             raise IntegratorError(
                 "Implicit: forces='implicit' has lumped inertia and viscosity. Use "
                 "quadrature='vertex', or forces='explicit'."
             )
 
-    def prepare(
-        self, problem: Problem, until: float
-    ) -> ImplicitRun | SynchronousRun | SplitRun:
+    def prepare(self, problem: Problem, until: float) -> ImplicitRun | SynchronousRun | SplitRun:
         """Choose the step and set up the run; collective.
 
         Raises:
@@ -128,6 +126,7 @@ class Implicit:
             same = Synchronous(self.step, self.safety, scheme, start, unstable_ok=self.unstable_ok)
             return same.prepare(problem, until)
         require_explicit_self_action(problem.scene, "solving for momenta")
+        refuse_dampers(problem, "Implicit's solving for momenta")
         if massless:
             raise IntegratorError(
                 "Implicit solves for momenta, which a descriptor without inertia does not have. "
@@ -135,6 +134,7 @@ class Implicit:
             )
         critical = self._critical(problem, scheme)
         if self.quadrature == "consistent":
+            require_unrepeated(problem.scene, "Implicit(quadrature='consistent')")
             # A cell's consistent mass is at least its lumped one over d + 2.
             critical /= float(np.sqrt(problem.disc.dim + 2))
         limit = problem.kinetic_range.limit(self.order)
@@ -153,6 +153,7 @@ class Implicit:
     def _split(self, problem: Problem, until: float) -> SplitRun:
         """The run that is implicit in ν: its step is that of u with ν held."""
         require_constant_inertia(problem, "Implicit(forces='implicit')")
+        refuse_dampers(problem, "Implicit(forces='implicit')")
         critical = self._critical(problem, HELD)
         step = self.step
         if step is None:

@@ -18,6 +18,7 @@ from complexbody.integrators.entries import Entries, energies
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.global_newton import GlobalNewton
 from complexbody.integrators.nodal_newton import NodalNewton
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -101,6 +102,8 @@ class ImplicitRun(ForceRun):
         self._masses = disc.volume * problem.masses.density[klass]
         self.solver.momenta(kernels.v, self.momentum)
         kernels.reset_forces()
+        if isinstance(self.solver, NodalNewton):
+            self.watch(self.solver.restless())
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -127,6 +130,8 @@ class ImplicitRun(ForceRun):
                 kernels.sums[4] += self._support_work(kernels.v, before)
                 kernels.sums[4] += self._support_work(self.next, 1.0 - before)
             self.solver.commit()
+            if self.activity is not None:
+                kernels.c.cb_look(self.state)
             if len(problem.load_value):
                 for t in (self.time, self.time + h):
                     power = problem.load_power(self.amplitude(t), kernels.v)
@@ -163,8 +168,10 @@ class ImplicitRun(ForceRun):
         if why and node >= 0:
             nu = problem.scene.components_of("nu")
             place = np.round(problem.disc.position[node, : problem.disc.dim], 9).tolist()
+            indices = problem.scene.mesh.geometry.input_global_indices
+            number = indices[problem.disc.dof[node]]
             text = (
-                f", on rank {problem.comm.rank} at the node {place} with ν = "
+                f", on rank {problem.comm.rank} at node {number}, {place}, with ν = "
                 f"{problem.kernels.x[node, nu].tolist()}, ν̇ = {rates[node, nu].tolist()}"
             )
         first = next(t for t in problem.comm.allgather(f"{why}{text}") if t)
@@ -173,6 +180,29 @@ class ImplicitRun(ForceRun):
             f"Use a smaller step than {self.step:.3g} s, or check the inertia there: the last "
             "state is kept."
         )
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two steps; arrays are views, valid until a step; collective."""
+        saved, n = super().snapshot(), self.problem.disc.n
+        saved.nodes |= {"previous": self.previous[:-1, :n], "momentum": self.momentum}
+        saved.sums["newton"] = self.count[:1]
+        saved.numbers |= {"most": max(self.problem.comm.allgather(int(self.count[1])))}
+        saved.numbers |= {"solved": int(self.count[2]), "linear": self.linear, **vars(self.range)}
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.previous[:-1, : self.problem.disc.n] = saved.nodes["previous"]
+        self.momentum[:] = saved.nodes["momentum"]
+        newton, numbers = saved.sums["newton"][0], saved.numbers
+        self.count[:] = newton, numbers["most"], numbers["solved"]
+        self.linear = int(numbers["linear"])
+        for name in vars(self.range):
+            setattr(self.range, name, numbers[name])
+        super()._refresh(saved)
+        if isinstance(self.solver, NodalNewton) and self.steps > 0:
+            self.solver.follow()
 
     # --- what a user sees at t_n ---------------------------------------------------------------
 
@@ -213,7 +243,7 @@ class ImplicitRun(ForceRun):
         """
         problem, sums = self.problem, self.problem.kernels.sums
         _, rates = self.sample()
-        common = energies(problem, self.mass, rates)
+        common = energies(problem, self.mass, rates, self.watched)
         common["kinetic_nu"] = self.solver.kinetic(rates)
         self._measure(rates)
         work, support, lost = float(sums[3]), float(sums[4]) + self.support_work, float(sums[0])
@@ -232,7 +262,7 @@ class ImplicitRun(ForceRun):
         nu, disc = problem.scene.components_of("nu"), problem.disc
         values = np.zeros((2, len(problem.scene.mesh.geometry.x), len(nu)))
         for out, records in zip(values, (problem.kernels.x, rates), strict=True):
-            out[disc.dof] = records[:-1, nu]
+            disc.spread(records[:-1, nu], out)
         try:
             measured = problem.convexity.measure(*values)
         except BodyError as error:
@@ -243,8 +273,9 @@ class ImplicitRun(ForceRun):
         if self.step > limit * (1 + 1e-9) and not self.method.unstable_ok:
             raise SolverError(
                 f"By t = {self.time:.6g} s the step {self.step:.3g} s is larger than T₀ = "
-                f"{limit:.3g} s of the inertia (γ = {self.range.gamma:.3g}): its solution need not "
-                "be the only one. Use a smaller step, or unstable_ok=True: the last state is kept."
+                f"{limit:.3g} s of the inertia (γ = {self.range.gamma:.3g}) in "
+                f"{self.range.place(self.method.order)}: its solution need not be the only one. "
+                "Use a smaller step, or unstable_ok=True: the last state is kept."
             )
 
     def summary(self) -> str:

@@ -40,14 +40,14 @@ def layout(k: int) -> tuple[type[ctypes.Structure], type[ctypes.Structure]]:
 
     class State(ctypes.Structure):
         _fields_ = (
-            *((name, i64) for name in ("nodes", "most", "unstable_ok")),
+            *((name, i64) for name in ("nodes", "most", "unstable_ok", "ranges")),
             *((name, real) for name in ("h", "s", "tolerance")),
             *(
                 (name, pointer)
                 for name in (
                     "x", "v", "f", "previous", "next", "momentum", "after", "reaction", "volume",
                     "density", "fixed", "counted", "start", "region", "share", "materials",
-                    "position", "sums", "count",
+                    "position", "sums", "count", "activity", "ends",
                 )
             ),
         )  # fmt: skip
@@ -67,7 +67,8 @@ class NodalNewton:
         self.run, k = run, problem.scene.descriptor
         defines = {"N": disc.n, "NU": disc.n - k, "NR": disc.record, "K": k}
         source = [f"#define {name} {value}" for name, value in defines.items()]
-        self.c = native.load("\n".join([*source, native.template("implicit.c")]))
+        source += [native.template(name) for name in ("quiet.h", "implicit.c")]
+        self.c = native.load("\n".join(source))
         for name in ("im_solve", "im_rates"):
             getattr(self.c, name).restype = ctypes.c_int64
         self.c.im_kinetic.restype = ctypes.c_double
@@ -95,7 +96,7 @@ class NodalNewton:
             "volume": disc.volume, "counted": disc.owned, "position": disc.position,
             "count": run.count, "sums": problem.kernels.sums, "x": problem.kernels.x,
             "v": problem.kernels.v, "f": problem.kernels.f, "previous": run.previous,
-            "next": run.next, "momentum": run.momentum, "after": run.after,
+            "next": run.next, "momentum": run.momentum, "after": run.after, "ends": run.ranges(),
         }  # fmt: skip
         self.state = State()
         for name, array in arrays.items():
@@ -108,6 +109,7 @@ class NodalNewton:
         s.nodes, s.most, s.unstable_ok = (
             disc.nodes, run.method.iterations, run.method.unstable_ok,
         )  # fmt: skip
+        s.ranges = len(run.ranges())
         s.h, s.s, s.tolerance = run.step, run.s, run.method.tolerance
         self._node, self._iterations = ctypes.c_int64(-1), ctypes.c_int64(0)
 
@@ -119,9 +121,24 @@ class NodalNewton:
             )
         )
 
+    def restless(self) -> npt.NDArray[np.bool_]:
+        """Nodes where rest does not solve the equation: ∂χ/∂ν̇ or ∂χ/∂ν is not 0 at (0, 0)."""
+        flags = np.zeros(self.run.problem.disc.nodes, np.uint8)
+        self.c.im_restless(ctypes.byref(self.state), native.pointer(flags))
+        return flags > 0
+
     def commit(self) -> None:
-        """Take the step that was solved for, and book it."""
+        """Take the step that was solved for, and book it.
+
+        Nodes at rest are solved for in the first step, like all others: what is wrong there shows.
+        """
         self.c.im_commit(ctypes.byref(self.state))
+        self.follow()
+
+    def follow(self) -> None:
+        """Skip nodes that the run's activity calls quiet, from now on."""
+        activity = self.run.activity
+        self.state.activity = None if activity is None else ctypes.addressof(activity.state)
 
     def momenta(self, rates: Array, out: Array) -> None:
         """∂χ/∂ν̇ at (ν, rates) integrated over each node's volume, shape (nodes, k)."""

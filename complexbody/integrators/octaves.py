@@ -16,7 +16,6 @@ allow longer steps than the smallest of a node's cells where few of them are sma
 from __future__ import annotations
 
 import ctypes
-import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -198,9 +197,11 @@ class Entries:
         node: Node of each entry; first: entries whose force changes at level l are [first[l], …).
         slot: Rows of level l in arrays of all levels' entries start here.
         touched: Nodes that cells of each level touch on any rank, shape (nodes, L + 1).
-        own, list: Entries of the nodes of level l are list[own[l]:own[l + 1]].
-        chunks, start, edge: Runs of blocks (first, last, region, 0) by level; those of level l are
+        list: Entries by the level of their nodes.
+        entries, owned: Parts of the entries, and of ``list``, by ranges of nodes (_parts).
+        chunks, start, edge: The discretisation's chunks by level; those of level l are
             [start[l], start[l + 1]), and those before edge[l] touch shared nodes.
+        number: Of these chunks, in the discretisation.
     """
 
     def __init__(self, problem: Problem, level: Ints, depth: int) -> None:
@@ -217,19 +218,35 @@ class Entries:
         self.slot[2:] = np.cumsum(len(node) - self.first[1:-1])
         mine = level[self.node]
         order = np.argsort(mine, kind="stable")
-        self.own, self.list = np.searchsorted(mine[order], levels), order.astype(np.int32)
+        self.list = order.astype(np.int32)
         self.of_node = np.full(disc.nodes, -1, np.int32)
         self.of_node[self.node] = np.arange(len(node))
-        blocks = np.arange(disc.blocks)
-        kind = np.stack([disc.group, blocks >= disc.boundary_blocks, disc.region], axis=1)
-        cuts = np.flatnonzero(np.any(np.diff(kind, axis=0) != 0, axis=1)) + 1
-        ends = [0, *cuts.tolist(), disc.blocks] if disc.blocks else [0]
-        rows = [(*kind[a], a, b) for a, b in itertools.pairwise(ends)]
-        rows.sort()
-        self.chunks = np.array([(a, b, r, 0) for _, _, r, a, b in rows], np.int64).reshape(-1, 4)
-        sides = np.array([2 * row[0] + row[1] for row in rows], np.int64)
+        edge = np.arange(len(disc.chunks)) < disc.boundary_chunks
+        group = disc.group[disc.chunks[:, 0]] if len(disc.chunks) else np.zeros(0, np.int64)
+        self.number = np.lexsort((disc.chunks[:, 2], ~edge, group)).astype(np.int64)
+        self.chunks = np.ascontiguousarray(disc.chunks[self.number])
+        sides = (2 * group + ~edge)[self.number]
         self.start = np.searchsorted(sides, 2 * levels)
         self.edge = np.searchsorted(sides, 2 * levels + 1)
+        ends = np.append(disc.chunks[:, 3], disc.nodes)
+        self.entries = _parts(top[self.node], self.node, ends, depth)
+        self.owned = _parts(mine[order], self.node[order], ends, depth)
+
+
+def _parts(level: Ints, node: Any, ends: Ints, depth: int) -> tuple[Ints, Ints, Ints]:
+    """(first, from, range): runs of one level and one range of nodes, of entries by level.
+
+    Args:
+        level: Of each entry.
+        node: Of each entry.
+        ends: Where the ranges of nodes end.
+        depth: L, the largest level.
+    """
+    place = np.searchsorted(ends, node, side="right")
+    new = (np.diff(level, prepend=-1) != 0) | (np.diff(place, prepend=-1) != 0)
+    start = np.flatnonzero(new)
+    first = np.searchsorted(level[start], np.arange(depth + 2))
+    return first, np.append(start, len(node)), place[start]
 
 
 class Message:
@@ -242,20 +259,19 @@ class Message:
 
     def __init__(self, problem: Problem, touched: npt.NDArray[np.bool_]) -> None:
         disc, index_map = problem.disc, _compat.node_map(problem.scene.mesh)
-        mine = np.zeros(_compat.node_count(problem.scene.mesh), np.bool_)
-        mine[disc.dof[touched]] = True
-        ranks = sharing(index_map, mine, problem.comm)
-        dofs = np.array(sorted(ranks), dtype=np.int32)
-        order = np.asarray(index_map.local_to_global(dofs)) if len(dofs) else np.zeros(0, np.int64)
-        shared = {i: ranks[int(dof)] for i, dof in enumerate(dofs)}
-        self.halo = halo = Halo(problem.comm, shared, order, disc.record)
-        self.node, f = disc.number[dofs].astype(np.int32), native.pointer(problem.kernels.f)
+        nodes = np.flatnonzero(touched)
+        names = disc.names(disc.dof[nodes])
+        ranks = sharing(names, index_map, problem.comm)
+        rows = np.array(sorted(ranks), dtype=np.int64)
+        shared = {i: ranks[int(row)] for i, row in enumerate(rows)}
+        self.halo = halo = Halo(problem.comm, shared, names[rows], disc.record)
+        self.node, f = nodes[rows].astype(np.int32), native.pointer(problem.kernels.f)
         self._pack = (
             ctypes.c_int64(len(halo.sends)), native.pointer(halo.sends), native.pointer(self.node),
             f, native.pointer(halo.outgoing),
         )  # fmt: skip
         self._add = (
-            ctypes.c_int64(len(dofs)), native.pointer(self.node), native.pointer(halo.start),
+            ctypes.c_int64(len(rows)), native.pointer(self.node), native.pointer(halo.start),
             native.pointer(halo.source), native.pointer(halo.incoming), f,
         )  # fmt: skip
 

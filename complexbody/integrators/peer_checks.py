@@ -10,6 +10,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from complexbody.errors import IntegratorError, StepError
+from complexbody.periodicity import require_unrepeated
 from complexbody.problem import Problem
 from complexbody.stiffness import require_explicit_self_action
 from complexbody.timesets import critical_step, require_constant_inertia
@@ -19,9 +20,10 @@ def require(method: Any, problem: Problem) -> str:
     """Refuse what no peer takes; the peer's name.
 
     Raises:
-        IntegratorError: for general χ, and self-action that is not integrated in full.
+        IntegratorError: for periodic scenes, general χ, and self-action not integrated in full.
     """
     name = type(method).__name__
+    require_unrepeated(problem.scene, name)
     require_constant_inertia(problem, name)
     require_explicit_self_action(problem.scene, name)
     if problem.scene.lumped:
@@ -66,32 +68,6 @@ def given_step(method: Any, until: float) -> float:
     return divided(method.step, until)
 
 
-def positive(method: Any, *names: str) -> None:
-    """Refuse options of a peer that are given and not positive.
-
-    Raises:
-        StepError: naming the first.
-    """
-    for name in names:
-        value = getattr(method, name)
-        if value is not None and not (np.isfinite(value) and value > 0):
-            raise StepError(f"{type(method).__name__}: {name} is {value}. Give a positive number.")
-
-
-def one_of(method: Any, name: str, allowed: tuple[str, ...]) -> None:
-    """Refuse an option of a peer that is none of those allowed.
-
-    Raises:
-        IntegratorError: naming those that are.
-    """
-    value = getattr(method, name)
-    if value not in allowed:
-        raise IntegratorError(
-            f"{type(method).__name__}: {name}={value!r} is not known. Give one of "
-            f"{', '.join(allowed)}."
-        )
-
-
 def divided(step: float, until: float) -> float:
     """The step, shortened so that the end of the run falls on one."""
     return float(until / np.ceil(until / min(step, until) * (1 - 1e-12)))
@@ -124,6 +100,12 @@ def limit_rk4(problem: Problem) -> float:
         scipy.linalg.eigvalsh(body.viscosity_matrix, body.inertia_matrix)[-1]
         for body in problem.whole.bodies
     ]
+    masses = problem.masses
+    if masses.absorbing:
+        # Relative to inertia, in which u and ν have the same unit; no inertia is refused before.
+        root = np.linalg.inv(np.linalg.cholesky(masses.full(masses.inertia, masses.density)))
+        own = np.linalg.eigvalsh(root @ masses.damping @ root.transpose(0, 2, 1)).max(initial=0.0)
+        rates.append(problem.comm.allreduce(float(own), op=MPI.MAX))
     largest = float(max(rates))
     limit = 2.615 / 2 * critical
     return min(limit, 2.785 / largest) if largest > 0 else limit

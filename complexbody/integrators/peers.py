@@ -13,17 +13,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-import numpy as np
-
 from complexbody.errors import IntegratorError
+from complexbody.given import is_finite, short
 from complexbody.integrators.assembled import AssembledRun
 from complexbody.integrators.newmark import NewmarkRun
+from complexbody.integrators.options import flags, one_of, petsc_options, positive
 from complexbody.integrators.peer_checks import (
     explicit_step,
     given_step,
     limit_rk4,
-    one_of,
-    positive,
     require,
     require_momenta,
 )
@@ -67,6 +65,7 @@ class AssembledLeapfrog:
         one_of(self, "force", ("assembly", "matrix"))
         one_of(self, "dissipation", SCHEMES)
         positive(self, "step", "safety")
+        flags(self, "unstable_ok")
 
     @property
     def order(self) -> int:
@@ -124,10 +123,12 @@ class Newmark:
 
     def __post_init__(self) -> None:
         positive(self, "step", "tolerance")
-        if not (self.gamma >= 0.5 and 2 * self.beta >= self.gamma and np.isfinite(self.beta)):
+        petsc_options(self)
+        known = is_finite(self.beta) and is_finite(self.gamma)
+        if not (known and self.gamma >= 0.5 and 2 * self.beta >= self.gamma):
             raise IntegratorError(
-                f"Newmark: beta={self.beta}, gamma={self.gamma} is not stable for all steps. Give "
-                "2·beta ≥ gamma ≥ ½, or use AssembledLeapfrog()."
+                f"Newmark: beta={short(self.beta)}, gamma={short(self.gamma)} is not stable for "
+                "all steps. Give 2·beta ≥ gamma ≥ ½, or use AssembledLeapfrog()."
             )
 
     @property
@@ -191,8 +192,12 @@ class PetscTS:
     def __post_init__(self) -> None:
         one_of(self, "kind", tuple(FORMS))
         positive(self, "step", "safety", "tolerance")
-        if not 0 <= self.radius <= 1:
-            raise IntegratorError(f"PetscTS: radius is {self.radius}. Give a number from 0 to 1.")
+        flags(self, "unstable_ok")
+        petsc_options(self)
+        if not (is_finite(self.radius) and 0 <= self.radius <= 1):
+            raise IntegratorError(
+                f"PetscTS: radius is {short(self.radius)}. Give a number from 0 to 1."
+            )
 
     @property
     def order(self) -> int:

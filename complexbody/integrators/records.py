@@ -20,6 +20,7 @@ from complexbody.integrators.activity import Counted
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.messages import Message
 from complexbody.integrators.record_books import entries
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.timetable import TimeSets
 from complexbody.kernels import events
 from complexbody.problem import Problem
@@ -40,8 +41,8 @@ class World(ctypes.Structure):
         *(
             (name, ctypes.c_void_p)
             for name in (
-                "record", "klass", "inverse_mass", "rate", "pace", "paced", "compliance", "eta",
-                "basis",
+                "record", "klass", "inverse_mass", "rate", "pace", "paced", "plain", "compliance",
+                "eta", "basis",
                 "collected",
                 "groups", "cell", "geometry", "coefficient", "held", "blend", "sums",
                 "counted", "coordinates", "forms", "touched", "touched_from", "activity",
@@ -64,6 +65,7 @@ class RecordRun(Counted):
         time: t at the last beat's end [s]; steps: beats done; step: their length [s].
         critical: Critical step of the smallest cell [s], that of a synchronous run.
         record: Node records (nodes + 1, doubles per node); the last one is padding.
+        losing: Whether nodes keep account of what they dissipate.
         acted: Nodes that loads or constant forces of the bodies act on, on any rank.
         skips_energies: Whether quiet cells have no energy either.
         time_sets: Who acts when: what the paper calls Θ, with speed-ups.
@@ -98,6 +100,7 @@ class RecordRun(Counted):
         self._pace = np.ascontiguousarray(self.rate.max(axis=1))
         self._paced = native.aligned(self.rate.shape)
         self._paced[:] = self.rate > 0
+        self._simple = self._plain_classes()
         self._counted = np.append(disc.owned, False)  # padding cells' node counts for nothing
         self.halo = disc.halo.widened(sent) if sent > disc.record else disc.halo
         self.sums = kernels.sums
@@ -120,10 +123,10 @@ class RecordRun(Counted):
         world.nodes, world.late, world.beyond = disc.nodes, disc.late, disc.late + disc.shared
         self._point(
             record=self.record, klass=masses.classes, inverse_mass=self.inverse_mass,
-            rate=self.rate, pace=self._pace, paced=self._paced, compliance=self.compliance,
-            eta=self.eta, basis=self.basis, collected=self.collected, cell=disc.cells,
-            geometry=disc.geometry, coefficient=kernels.coefficients, sums=self.sums,
-            counted=self._counted, coordinates=disc.position,
+            rate=self.rate, pace=self._pace, paced=self._paced, plain=self._simple,
+            compliance=self.compliance, eta=self.eta, basis=self.basis, collected=self.collected,
+            cell=disc.cells, geometry=disc.geometry, coefficient=kernels.coefficients,
+            sums=self.sums, counted=self._counted, coordinates=disc.position,
         )  # fmt: skip
         if len(masses.density) == 1:
             world.klass = 0
@@ -141,7 +144,9 @@ class RecordRun(Counted):
         problem, method = self.problem, self.method
         disc, masses = problem.disc, problem.masses
         n, record = disc.n, disc.record
-        size, self._time, self._inverse = events.record_size(n, record, bool(method.balanced))
+        self.losing = method.schedule == "exact" and masses.damped
+        third = bool(method.balanced) or self.losing
+        size, self._time, self._inverse = events.record_size(n, record, third)
         self.record = native.aligned((disc.nodes + 1, size))
         self.record[:-1, :n] = problem.initial_fields
         self.record[:-1, self._inverse] = 1.0 / disc.volume
@@ -166,6 +171,12 @@ class RecordRun(Counted):
         klass = masses.classes[:-1]
         rates = np.einsum("aij,aj->ai", self.inverse_basis[klass], problem.initial_rates)
         self.record[:-1, record : record + n] = np.where(inert[klass], 0.0, rates)
+
+    def _plain_classes(self) -> npt.NDArray[np.uint8]:
+        """Classes without coupling whose components have inertia, and one rate or none."""
+        own = np.abs(self.basis - np.eye(self.problem.disc.n)).max(axis=(1, 2)) == 0
+        one = np.where(self._paced > 0, self.rate == self._pace[:, None], True).all(axis=1)
+        return (own & one & ~np.any(self.compliance, axis=1)).astype(np.uint8)
 
     @property
     def time(self) -> float:
@@ -274,6 +285,42 @@ class RecordRun(Counted):
         if key not in self._messages:
             self._messages[key] = Message(self.halo.part(rows), rows, self._world, self.c)
         return self._messages[key]
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two beats; arrays are views, valid until a beat; collective."""
+        saved = Snapshot(
+            {"steps": self.steps},
+            nodes={"record": self.record[:-1]},
+            sums={"sums": self.sums, "counts": self._counts(),
+                  "work": np.array([self.work, self.support_work])},
+        )  # fmt: skip
+        for name in ("force", "kinetic"):
+            values = getattr(self, f"_support_{name}")
+            saved.numbers[name] = self.problem.comm.allreduce(values is not None, op=MPI.LOR)
+            if saved.numbers[name]:
+                dense = np.zeros((self.problem.disc.nodes, self.problem.disc.n))
+                dense[self.problem.moving] = values
+                saved.nodes[name] = dense
+        return saved
+
+    def restore(self, saved: Snapshot) -> None:
+        """Go on from a snapshot of a run of the same scene, step and options; collective."""
+        own = self.record[:-1, self._inverse].copy()  # of this number of ranks, to the last bit
+        self.record[:-1] = saved.nodes["record"]
+        self.record[:-1, self._inverse] = own
+        self.sums[:] = saved.sums["sums"]
+        self.work, self.support_work = (float(v) for v in saved.sums["work"])
+        self.steps = int(saved.numbers["steps"])
+        for name in ("force", "kinetic"):
+            if saved.numbers[name]:
+                setattr(self, f"_support_{name}", saved.nodes[name][self.problem.moving])
+        self._refresh(saved)
+        self._recount(saved.sums["counts"])
+
+    def _refresh(self, saved: Snapshot) -> None:
+        """Take what else a kind of run has in a snapshot."""
 
     # --- what a user sees at a beat's end ------------------------------------------------------
 

@@ -191,3 +191,5 @@ class SemiDiscrete:
         """Free PETSc's objects."""
         if self.matrix is not None:
             self.matrix.destroy()
+        for function in (self.q, self._r, self._buffer):
+            _compat.free_vector(function)

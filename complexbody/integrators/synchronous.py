@@ -12,7 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from complexbody.errors import IntegratorError, StepError
+from complexbody.errors import StepError
+from complexbody.integrators.options import flags, one_of, positive
 from complexbody.integrators.synchronous_run import SynchronousRun
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
@@ -53,20 +54,11 @@ class Synchronous:
     inertia: ClassVar[str] = "number or k×k matrix; 0 where viscosity is positive"
 
     def __post_init__(self) -> None:
-        for name, allowed in (
-            ("dissipation", SCHEMES),
-            ("start", ("trapezoidal", "one-sided")),
-            ("critical", ("cells", "global")),
-        ):
-            if getattr(self, name) not in allowed:
-                raise IntegratorError(
-                    f"Synchronous: {name}={getattr(self, name)!r} is not known. Give one of "
-                    f"{', '.join(allowed)}."
-                )
-        for name in ("step", "safety"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
-                raise StepError(f"Synchronous: {name} is {value}. Give a positive number.")
+        one_of(self, "dissipation", SCHEMES)
+        one_of(self, "start", ("trapezoidal", "one-sided"))
+        one_of(self, "critical", ("cells", "global"))
+        positive(self, "step", "safety")
+        flags(self, "unstable_ok")
 
     @property
     def order(self) -> int:

@@ -16,11 +16,9 @@ from mpi4py import MPI
 
 from complexbody import native
 from complexbody.errors import IntegratorError
-from complexbody.integrators.activity import ENOUGH, Activity, active
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.synchronous_books import entries
-from complexbody.kernels.library import State
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -30,7 +28,7 @@ Array = npt.NDArray[np.float64]
 
 
 def refuse_partial(problem: Problem) -> None:
-    """Refuse moving supports of some components of a descriptor whose inertia couples them.
+    """Refuse moving supports of some of the components that inertia or damping couples.
 
     Raises:
         IntegratorError: on all ranks.
@@ -38,7 +36,17 @@ def refuse_partial(problem: Problem) -> None:
     n_u, (rows, columns) = problem.scene.displacement, problem.moving
     masses, nodes = problem.masses, rows[columns >= n_u]
     bad = not np.all(masses.fixed[masses.classes[nodes], n_u:])
-    if problem.comm.allreduce(bool(bad), op=MPI.LOR):
+    # Dampers couple components of u, too, and more of some nodes than of others.
+    klass = masses.classes[rows]
+    linked = masses.damping[klass, columns] != 0
+    linked[np.arange(len(rows)), columns] = False
+    open_ = bool(np.any(linked & ~masses.fixed[klass]))
+    if problem.comm.allreduce(open_, op=MPI.LOR) and masses.absorbing:
+        raise IntegratorError(
+            "A moving support prescribes some of the components that an absorbing boundary "
+            "couples there. Prescribe all of them, or let the two not overlap."
+        )
+    if problem.comm.allreduce(bool(bad), op=MPI.LOR) and not masses.only_dampers_couple:
         raise IntegratorError(
             "A moving support prescribes some components of a descriptor whose inertia or "
             "viscosity couples them. Prescribe all components there, or diagonalise the matrix."
@@ -50,8 +58,6 @@ class SynchronousRun(ForceRun):
 
     Attributes:
         time: t_n [s]; steps: n; step: h [s]; critical: the critical step [s].
-        watched: What the C functions read, with the activity in it; None if energies of quiet cells
-            are not zero.
         support_work: Work of this rank's moving supports in the half step before a sample [J].
     """
 
@@ -61,9 +67,8 @@ class SynchronousRun(ForceRun):
         disc, kernels, masses = problem.disc, problem.kernels, problem.masses
         if not masses.diagonal:  # the same on all ranks, unlike what moves there
             refuse_partial(problem)
-        kernels.select(masses.diagonal, masses.damped)
+        kernels.select(masses.diagonal, masses.damped, masses.whole)
         self.c = kernels.c
-        self.watched: State | None = None
         rec = masses.recursion(step, method.dissipation)
         if method.start == "one-sided":
             # Kicks sit at the left ends of intervals: momenta at t_n are those before the kick.
@@ -80,6 +85,11 @@ class SynchronousRun(ForceRun):
         self.mass = np.ascontiguousarray(rec.mass)
         s = kernels.state
         s.step = step
+        off = ~np.eye(disc.n, dtype=bool)
+        coupled = [np.any(m[:, off], axis=1) for m in (rec.alpha, rec.beta, rec.viscosity)]
+        self._plain = (~np.any(coupled, axis=0)).astype(np.uint8)
+        # Only of dampers: in other scenes all nodes have blocks alike.
+        s.plain = self._plain.ctypes.data if masses.whole else 0
         s.alpha, s.beta, s.eta = (t.ctypes.data for t in self._tables)
         self._single = len(masses.density) == 1
         s.klass = 0 if self._single else masses.classes.ctypes.data
@@ -90,26 +100,7 @@ class SynchronousRun(ForceRun):
         kernels.x[:-1, : disc.n] = problem.initial_fields
         self.support_work = 0.0
         kernels.reset_forces()
-        # A copy, since whoever else asks the kernels asks for all cells.
-        self._own = State.from_buffer_copy(s)
-        self.state = ctypes.byref(self._own)
-
-    def watch(self) -> None:
-        """Skip what is quiet from now on, if enough is; before the first step."""
-        problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
-        if not (problem.quiet and disc.blocks):
-            return
-        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
-        stirred = (stirred | (kernels.f[:-1, : disc.n] != 0)).any(axis=1)
-        stirred[problem.load_position // disc.record] = True
-        if active(disc.cells, stirred) > ENOUGH:
-            return
-        awake, energetic = kernels.restless()
-        ends, late = np.append(disc.chunks[:, 3], disc.nodes), np.array([len(disc.chunks)])
-        self.activity = Activity(self.c, disc.chunks[:, 1], disc.cells, ends, stirred, awake, late)
-        self._own.activity = ctypes.addressof(self.activity.state)
-        self.watched = None if energetic else self._own
-        self.c.cb_look(self.state)
+        self._state_of_its_own()
 
     # --- steps -------------------------------------------------------------------------------
 

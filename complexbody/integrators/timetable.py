@@ -70,6 +70,7 @@ class TimeSets:
     octaves: Ints
     _comm: Any = field(repr=False)
     _nodes: Any = field(repr=False)
+    _numbers: Any = field(repr=False)
     _elsewhere: dict[int, Array] = field(repr=False)
 
     @property
@@ -112,12 +113,13 @@ class TimeSets:
         Raises:
             IntegratorError: if no cell of this rank has the node (on this rank alone).
         """
-        mine = np.flatnonzero((self._nodes == node).any(axis=1))
+        own = int(self._numbers[node]) if 0 <= node < len(self._numbers) else -1
+        mine = np.flatnonzero((self._nodes == own).any(axis=1)) if own >= 0 else np.zeros(0, int)
         if not len(mine):
             raise IntegratorError(
                 f"TimeSets: no cell of this rank has a node {node}. Give one of its cells' nodes."
             )
-        every = np.concatenate([self.steps[mine], self._elsewhere.get(int(node), np.zeros(0))])
+        every = np.concatenate([self.steps[mine], self._elsewhere.get(own, np.zeros(0))])
         last = self.window if end is None else end
         times = [self._multiples(float(h), start, last) for h in np.unique(every)]
         return np.unique(np.concatenate(times))
@@ -217,8 +219,8 @@ def time_sets(
         scheduled=float(cells * window / (SYNCHRONOUS_SAFETY * smallest) / updates),
         imbalance=busiest * comm.size / updates - 1.0,
         octaves=np.asarray(comm.allreduce(octaves), dtype=np.int64),
-        _comm=comm, _nodes=_compat.cell_nodes(disc.scene.mesh)[: disc.count],
-        _elsewhere=_elsewhere(disc, steps),
+        _comm=comm, _nodes=disc.number[_compat.cell_nodes(disc.scene.mesh)[: disc.count]],
+        _numbers=disc.number, _elsewhere=_elsewhere(disc, steps),
     )  # fmt: skip
 
 
@@ -236,7 +238,7 @@ def _octaves(ratio: Array) -> Ints:
 
 
 def _elsewhere(disc: Discretisation, steps: Array) -> dict[int, Array]:
-    """Distinct steps of other ranks' cells at each shared node, by geometry node; collective."""
+    """Distinct steps of other ranks' cells at each shared node, by own number; collective."""
     if disc.comm.size == 1:
         return {}
     real, halo = disc.source_cell >= 0, disc.halo
@@ -258,8 +260,8 @@ def _elsewhere(disc: Discretisation, steps: Array) -> dict[int, Array]:
         halo.end()
         heard[:, first : first + width] = halo.incoming[:, : part.shape[1]]
     out: dict[int, Array] = {}
-    for i, node in enumerate(disc.dof[disc.late : disc.late + disc.shared]):
+    for i in range(disc.shared):
         source = halo.source[halo.start[i] : halo.start[i + 1]]
         values = heard[source[source >= 0]]
-        out[int(node)] = np.unique(values[values > 0])
+        out[disc.late + i] = np.unique(values[values > 0])
     return out

@@ -99,6 +99,24 @@ def graded(problem: Problem, counts: Ints) -> Ints:
     return out
 
 
+def apart(problem: Problem, counts: Ints) -> Ints:
+    """−N_K for cells that touch a damped node of an absorbing boundary: groups of their own.
+
+    Args:
+        problem: The scene.
+        counts: N_K of this rank's cells, in the order of dolfinx's owned cells.
+    """
+    disc, masses = problem.disc, problem.masses
+    if not masses.absorbing:
+        return counts
+    damped = np.append(masses.dampers[masses.classes[:-1]], False)
+    real = disc.source_cell >= 0
+    beside = damped[disc.cells].any(axis=1)
+    out = counts.copy()
+    out[disc.source_cell[real & beside]] *= -1
+    return out
+
+
 @dataclass
 class Cut:
     """A time at which ranks exchange kicks: after the shared-node events [first, shared).
@@ -118,7 +136,7 @@ class WindowPlan:
     """Groups and events of one window on this rank; collective.
 
     Args:
-        disc: Arrays whose blocks are grouped by N_K.
+        disc: Arrays whose blocks are grouped by N_K, or −N_K for cells that stay apart.
         window: W [s].
 
     Attributes:
@@ -140,7 +158,7 @@ class WindowPlan:
         self.groups = (Group * max(len(runs), 1))()
         self.edge, self.updates, chunk = 0, 0, 0
         for i, (first, last) in enumerate(runs):
-            count = int(disc.group[first])
+            count = abs(int(disc.group[first]))
             step = window / count
             self.groups[i] = Group(first, last, int(disc.region[first]), count, chunk, step)
             chunk += -(-(last - first) // CHUNK)
@@ -203,7 +221,7 @@ def _touched(disc: Discretisation, divisions: list[int]) -> npt.NDArray[np.bool_
     """Shared nodes that cells of each N_K touch on any rank, (nodes, divisions); collective."""
     flags = np.zeros((disc.nodes + 1, len(divisions)))
     for block in range(disc.boundary_blocks):
-        flags[disc.cells[block].ravel(), divisions.index(int(disc.group[block]))] = 1.0
+        flags[disc.cells[block].ravel(), divisions.index(abs(int(disc.group[block])))] = 1.0
     disc.sum_shared(flags[:-1])
     return flags[disc.late : disc.late + disc.shared] > 0
 

@@ -2,13 +2,17 @@
  * Asynchronous events: what nodes and cells carry, and how a node drifts from kick to kick. Behind
  * vectors.h, tabulated.h and quiet.h. A node's record holds everything a drift needs:
  *   [ position (NR) | rate (NR) | acceleration (NR, only if BALANCED) | time, 1/volume ]
+ * and on an EXACT schedule that is DAMPED what the node has dissipated in place of an acceleration:
+ * its drifts have an order, those of different nodes depend on how the schedule goes.
  * time and 1/volume sit in the padding of position where there is room (TIME, INVERSE).
- * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK. Unless SLOW,
- * inertia is diagonal and the components of nu share one rate. */
+ * Needs N, NU, NR, DIM, GEOMETRY, COEFFICIENTS, BALANCED, DAMPED, SCHEME, SLOW, CHUNK, EXACT. Unless
+ * SLOW, inertia is diagonal and the components of nu share one rate: so do those of `plain`
+ * classes. */
 
 #define VN (NR < 8 ? NR : 8)
 typedef double nvec __attribute__((vector_size(8 * VN), aligned(8)));
-#define PARTS (2 + BALANCED)
+#define LOSING (EXACT && DAMPED)
+#define PARTS (2 + BALANCED + LOSING)
 #if NR - N >= 2
 #define RECORD (PARTS * NR)
 #define TIME N
@@ -31,7 +35,8 @@ typedef struct {
   const int32_t *klass;       /* class of a node, or NULL */
   const double *inverse_mass; /* [class][NR]: 0 where prescribed; 1 where there is no inertia */
   const double *rate;         /* [class][NR]: eta / inertia */
-  const double *pace, *paced; /* unless SLOW: [class] the one rate of a class, [class][NR] 1 where it holds */
+  const double *pace, *paced; /* of plain classes: [class] the one rate of a class, [class][NR] 1 where it holds */
+  const uint8_t *plain;       /* if SLOW: [class] 1 where a node may be drifted as if it were not */
   const double *compliance;   /* [class][NR]: 1 / eta where there is no inertia, else 0 */
   const double *eta;          /* [class][NR]: damping per volume */
   const double *basis;        /* [class][N][N]: V, in which all these are diagonal */
@@ -50,6 +55,18 @@ typedef struct {
   activity *activity;         /* of chunks of CHUNK blocks and ranges of RANGE nodes, or NULL */
   double start;               /* of the window */
 } world;
+
+#if SLOW
+/* True if W nodes are all of plain classes. */
+INLINE int all_plain(const world *s, const int32_t *nodes) {
+  if (!s->klass) return s->plain[0];
+  int all = 1;
+  for (int l = 0; l < W; l++) all &= s->plain[s->klass[nodes[l]]];
+  return all;
+}
+#else
+#define all_plain(s, nodes) 1
+#endif
 
 INLINE double *record_of(const world *s, int64_t a) { return s->record + a * RECORD; }
 
@@ -146,7 +163,11 @@ INLINE void drift_slowly(const world *s, int64_t a, double dt) {
     for (int j = 0; j < N; j++) sum += V[i * N + j] * mean[j];
     r[i] += dt * sum;
   }
+#if LOSING
+  r[2 * NR] += s->counted[a] ? dt * lost / r[INVERSE] : 0.0;
+#else
   if (s->counted[a]) s->sums[0] += dt * lost / r[INVERSE];
+#endif
 }
 #endif
 
@@ -176,12 +197,16 @@ INLINE nvec timed(nvec x, int g, double t) {
 /* Drift W nodes (which may repeat), each to its own t. */
 INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
 #if SLOW
-  for (int l = 0; l < W; l++) {
-    double *r = record_of(s, nodes[l]);
-    drift_slowly(s, nodes[l], t[l] - r[TIME]);
-    r[TIME] = t[l];
+  if (!all_plain(s, nodes)) {
+    for (int l = 0; l < W; l++) {
+      double *r = record_of(s, nodes[l]);
+      drift_slowly(s, nodes[l], t[l] - r[TIME]);
+      r[TIME] = t[l];
+    }
+    return;
   }
-#elif DAMPED
+#endif
+#if DAMPED
   vec dt, z, volume;
   for (int l = 0; l < W; l++) {
     const double *r = record_of(s, nodes[l]);
@@ -194,8 +219,10 @@ INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
   memcpy(c, &d, sizeof c);
   volume = dt / volume;
   memcpy(weight, &volume, sizeof weight);
+#if !LOSING
   nvec lost[NR / VN];
   memset(lost, 0, sizeof lost);
+#endif
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);
     if (r[TIME] == t[l]) continue; /* at rest in time, or a node that comes again */
@@ -213,13 +240,19 @@ INLINE void drift(const world *s, const int32_t *nodes, const vec t) {
       v[g] += nu[g] * ((c[3][l] - 1.0) * v[g]);
 #endif
       x[g] = timed(x[g] + c[0][l] * mean, g, t[l]);
+#if LOSING
+      ((nvec *)(r + 2 * NR))[g] += weight[l] * eta[g] * mean * mean;
+#else
       lost[g] += weight[l] * eta[g] * mean * mean;
+#endif
     }
     if (TIME >= NR) r[TIME] = t[l];
   }
+#if !LOSING
   double sum = 0;
   for (int i = 0; i < NR; i++) sum += lost[i / VN][i % VN];
   s->sums[0] += sum;
+#endif
 #else
   for (int l = 0; l < W; l++) {
     double *r = record_of(s, nodes[l]);

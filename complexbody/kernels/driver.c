@@ -2,7 +2,8 @@
  * Loops over blocks of cells and over nodes: forces, energies, and the synchronous step.
  *
  * Assembled behind vectors.h, quiet.h and the regions' functions; needs N, NU, NR, DIM, GEOMETRY,
- * COEFFICIENTS, DIAGONAL, DAMPED, FORCE(region, ...), ENERGY(region, ...), RESTLESS(region, ...).
+ * COEFFICIENTS, DIAGONAL, DAMPED, COUPLED (where the block of a node begins that inertia or damping
+ * couples), FORCE(region, ...), ENERGY(region, ...), RESTLESS(region, ...).
  *
  * One step (kick, drift) with effective mass Mh and damping D, from the discrete principle:
  *   (Mh + hD/2) v+ = (Mh - hD/2) v- + h f,   x += h v+
@@ -29,6 +30,7 @@ typedef struct {
   const uint8_t *counted;         /* 1 where this rank counts the node in sums, [node] */
   const tabulated *forms;         /* [region]{force, stored, potential energy}, where FFCx made them */
   activity *activity;             /* of chunks, and of the nodes each finishes; or NULL */
+  const uint8_t *plain;       /* unless DIAGONAL: [class] 1 where the matrices are; or NULL */
 } state;
 
 #define VN (NR < 8 ? NR : 8) /* components of one node vector */
@@ -65,15 +67,21 @@ static APART void update(const state *s, int64_t first, int64_t last) {
     const double *al = s->alpha + k * N * N, *be = s->beta + k * N * N;
     double now[NR] = {0};
     const double *vo = (const double *)v, *fo = (const double *)f;
-    for (int i = 0; i < NU; i++) now[i] = al[i * N + i] * vo[i] + be[i * N + i] * iv * fo[i];
-    for (int i = NU; i < N; i++) {
+    const int coupled = s->plain && s->plain[k] ? N : COUPLED;
+    for (int i = 0; i < coupled; i++) now[i] = al[i * N + i] * vo[i] + be[i * N + i] * iv * fo[i];
+    for (int i = coupled; i < N; i++) {
       double sum = 0;
-      for (int j = NU; j < N; j++) sum += al[i * N + j] * vo[j] + be[i * N + j] * iv * fo[j];
+      for (int j = COUPLED; j < N; j++) sum += al[i * N + j] * vo[j] + be[i * N + j] * iv * fo[j];
       now[i] = sum;
     }
 #if DAMPED
-    for (int i = NU; i < N; i++)
-      for (int j = NU; j < N; j++)
+    if (s->plain && s->plain[k])
+      for (int i = 0; i < N; i++) {
+        const double both = vo[i] + now[i];
+        lost[0][0] += vol * s->eta[(k * N + i) * N + i] * both * both;
+      }
+    for (int i = coupled; i < N; i++)
+      for (int j = COUPLED; j < N; j++)
         lost[0][0] += vol * s->eta[k * N * N + i * N + j] * (vo[i] + now[i]) * (vo[j] + now[j]);
 #endif
 #endif
@@ -133,14 +141,7 @@ void cb_forces(const state *s) { act(s, 0, s->chunks, 0); }
 /* After a step: chunks that the motion has reached. Forces depend on positions alone. */
 void cb_look(const state *s) {
   activity *q = quiet(s);
-  for (int64_t c = 0; q && c < q->chunks; c++) {
-    if (q->awake[c] || !q->near[c]) continue;
-    for (int64_t i = q->node_from[c]; i < q->node_from[c + 1]; i++)
-      if (!at_zero(s->x + (int64_t)q->node[i] * NR, NR)) {
-        wake(q, c);
-        break;
-      }
-  }
+  for (int64_t c = 0; q && c < q->chunks; c++) look_at(q, c, s->x, NR);
 }
 
 /* Where cells have forces (by chunk) or energies even at x = 0, which s->x must be. */

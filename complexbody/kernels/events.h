@@ -62,7 +62,7 @@ INLINE int collects(const world *s, const int32_t *c) {
 /* The nodes of W cells: rate (PART 1) or acceleration (2) += weight in / (volume m); shared ones collect. */
 enum { RATE = 1, ACCELERATION = 2 };
 INLINE void give(const world *s, const int32_t *c, const vec weight, const vec in[NR], const int PART) {
-  if (collects(s, c) || SLOW || (NR < W && NR != 4)) {
+  if (collects(s, c) || !all_plain(s, c) || (NR < W && NR != 4)) {
     for (int l = 0; l < W; l++) {
       const int64_t a = c[l];
       double *r = record_of(s, a), f[N], *sum = s->collected + (a - s->late) * SENT + (PART - 1) * NR;
@@ -74,7 +74,7 @@ INLINE void give(const world *s, const int32_t *c, const vec weight, const vec i
     }
     return;
   }
-#if !SLOW && NR >= W
+#if NR >= W
   for (int g = 0; g < NR; g += W) {
     vec f[W];
     for (int i = 0; i < W; i++) f[i] = weight * in[g + i];
@@ -85,7 +85,7 @@ INLINE void give(const world *s, const int32_t *c, const vec weight, const vec i
       *(vec_u *)(r + PART * NR + g) += r[INVERSE] * *(const vec_u *)m * f[l];
     }
   }
-#elif !SLOW && NR == 4
+#elif NR == 4
   vec f[4];
   for (int i = 0; i < 4; i++) f[i] = weight * in[i];
   transpose4(f);

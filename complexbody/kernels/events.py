@@ -47,9 +47,15 @@ class Forms:
             self.records[r] = force.record
 
 
-def record_size(components: int, record: int, balanced: bool) -> tuple[int, int, int]:
-    """(doubles per node, slot of its time, slot of 1/volume), as in events.h."""
-    parts = 3 if balanced else 2
+def record_size(components: int, record: int, third: bool) -> tuple[int, int, int]:
+    """(doubles per node, slot of its time, slot of 1/volume), as in drifts.h.
+
+    Args:
+        components: N.
+        record: NR.
+        third: Whether there is more than position and rate.
+    """
+    parts = 3 if third else 2
     if record - components >= 2:
         return parts * record, components, components + 1
     return (parts + (2 if record < 2 else 1)) * record, parts * record, parts * record + 1
@@ -73,7 +79,7 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
         "BALANCED": int(bool(method.balanced)), "DAMPED": int(damped),
         "SLOW": int(slow), "SCHEME": SCHEMES.index(method.dissipation),
         "CORRECTED": int(bool(method.corrected)), "PACKED": packed_size(kernels),
-        "CHUNK": CHUNK, "RANGE": RANGE,
+        "CHUNK": CHUNK, "RANGE": RANGE, "EXACT": int(exact),
     }  # fmt: skip
     parts = [f"#define {name} {value}" for name, value in defines.items()]
     files = ("vectors.h", "tabulated.h", "quiet.h", "drifts.h", "events.h")
@@ -99,8 +105,8 @@ def load(kernels: Kernels, method: AVI, damped: bool, slow: bool) -> ctypes.CDLL
     if exact:
         head = "LONE(region, s, c, cell, b, k, t, soft, count, out)"
     parts += [f"#define {head} switch (region) {{ {cases}}}", native.template("events.c")]
-    library = native.load("\n".join([*parts, native.template("exact.c") if exact else ""]))
-    return library
+    parts += [native.template(name) for name in ("exact.c", "reached.c") if exact]
+    return native.load("\n".join(parts))
 
 
 def packed_size(kernels: Kernels) -> int:

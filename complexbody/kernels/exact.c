@@ -27,7 +27,7 @@ typedef struct {
   const int32_t *region;    /* [cell] */
   const double *step;       /* of cells and visits by rank and global number: [index] */
   int64_t *counter;         /* [index]: the next event's j */
-  double *due;              /* [index]: its time, infinite for padding */
+  double *due;              /* [index]: its time, infinite for padding and quiet cells */
   const int32_t *actor;     /* [index]: cell, or cells + visit */
   const int32_t *index;     /* [cell] */
   const int32_t *row;       /* [visit]: row of the receive table, node and neighbour */
@@ -296,7 +296,7 @@ void cb_exact_complete(const world *s, const schedule *x, int64_t blocks, double
     const int32_t *c = s->cell + m * SLOTS * W;
     vec out[DIM + 1][NR], weight = {0};
     int32_t cell[W];
-    int count = 0;
+    int count = 0, due = 0;
     for (int l = 0; l < W; l++) {
       cell[l] = (int32_t)(m * W + l);
       const int32_t i = x->index[cell[l]];
@@ -304,8 +304,10 @@ void cb_exact_complete(const world *s, const schedule *x, int64_t blocks, double
       const int64_t j = x->counter[i];
       if (c[l] >= s->nodes) continue;
       count = l + 1;
+      due |= x->due[i] < INFINITY;
       if (j > 0) weight[l] = x->trapezoidal ? t - (j - 0.5) * h : t - j * h;
     }
+    if (!due) continue; /* cells that are quiet */
     LONE(x->region[m * W], s, c, cell, b, k, (vec){0} + t, (vec){0}, count, out);
     for (int a = 0; a <= DIM; a++) kick(s, c + a * W, weight, out[a]);
   }

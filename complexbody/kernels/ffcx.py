@@ -30,6 +30,7 @@ class TabulatedRecord(ctypes.Structure):
         ("after", ctypes.c_int64),
         ("unknowns", ctypes.c_int64),
         ("pack", ctypes.c_void_p),
+        ("corners", ctypes.c_void_p),
         ("constants", ctypes.c_void_p),
     )
 
@@ -94,6 +95,9 @@ class Tabulated:
             compiled,
         ]
         self.record.pack = self._keep[0].ctypes.data if packs.size else self._keep[1].ctypes.data
+        if disc.corners is not None:
+            self._keep.append(disc.corners)
+            self.record.corners = disc.corners.ctypes.data
         self.record.constants = self._keep[1].ctypes.data
 
     @staticmethod

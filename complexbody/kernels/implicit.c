@@ -5,10 +5,11 @@
  * of the next drift satisfy, per node and integrated over its volume,
  *   p(m, r) - (1-s) h q(m, r) + (1-s) h eta r = momentum + h f,   p = dchi/dnu_dot, q = dchi/dnu,
  * and the drift leaves momentum = p + s h q - s h eta r. Two passes: the first only solves, so that
- * a failure anywhere leaves the last state whole. */
+ * a failure anywhere leaves the last state whole.
+ *
+ * Where p = q = 0 at nu = r = 0, nodes at zero without force stay there, with no iteration: those of
+ * quiet ranges are passed by. Behind quiet.h. */
 #include <math.h>
-#include <stdint.h>
-#include <string.h>
 
 typedef void (*tabulate)(double *, const double *, const double *, const double *, const int *,
                          const uint8_t *, void *);
@@ -20,7 +21,7 @@ typedef struct {
 } material;
 
 typedef struct {
-  int64_t nodes, most, unstable_ok;
+  int64_t nodes, most, unstable_ok, ranges;
   double h, s, tolerance;
   double *x, *v, *f, *previous, *next; /* [node][NR] */
   double *momentum, *after;            /* [node][K] */
@@ -34,7 +35,16 @@ typedef struct {
   const double *position;              /* [node][3] */
   double *sums;                        /* as in driver.c */
   int64_t *count;                      /* Newton iterations: all, most; solves */
+  const activity *activity;            /* or NULL */
+  const int64_t *ends;                 /* of ranges of nodes, [ranges] */
 } implicit;
+
+/* Nodes a, but for those of quiet ranges. */
+#define EACH_NODE(s, a)                                                                            \
+  const activity *q_ = (s)->activity && (s)->activity->on ? (s)->activity : NULL;                  \
+  for (int64_t r_ = 0; r_ < (s)->ranges; r_++)                                                     \
+    if (!q_ || q_->stirred[r_])                                                                    \
+      for (int64_t a = r_ ? (s)->ends[r_ - 1] : 0; a < (s)->ends[r_]; a++)
 
 typedef struct { double chi, p[K], q[K], pv[K][K], pn[K][K], qq[K][K], eta[K][K]; } local;
 
@@ -180,7 +190,7 @@ static int newton(const implicit *s, int64_t a, double h, double *r, const doubl
 /* Solve at all nodes for the next rates; returns the reason and *node of a failure. */
 int64_t im_solve(const implicit *s, int64_t *node, int64_t *iterations) {
   const double h = s->h;
-  for (int64_t a = 0; a < s->nodes; a++) {
+  EACH_NODE(s, a) {
     const double *v = s->v + a * NR, *f = s->f + a * NR;
     double *next = s->next + a * NR, r[K], b[K];
     const uint8_t *fixed = s->fixed + a * N;
@@ -217,7 +227,7 @@ int64_t im_solve(const implicit *s, int64_t *node, int64_t *iterations) {
 void im_commit(const implicit *s) {
   const double h = s->h;
   double lost = 0, jump_u = 0, jump_nu = 0;
-  for (int64_t a = 0; a < s->nodes; a++) {
+  EACH_NODE(s, a) {
     double *x = s->x + a * NR, *v = s->v + a * NR, *next = s->next + a * NR;
     const double vol = s->counted[a] ? s->volume[a] : 0.0, *r = next + NU;
     for (int64_t i = s->start[a]; i < s->start[a + 1] && vol > 0; i++)
@@ -229,11 +239,21 @@ void im_commit(const implicit *s) {
       v[i] = next[i];
       x[i] += h * next[i];
     }
+    memcpy(s->momentum + a * K, s->after + a * K, K * sizeof(double));
   }
-  memcpy(s->momentum, s->after, s->nodes * K * sizeof(double));
   s->sums[0] += lost;
   s->sums[1] += jump_u;
   s->sums[2] += jump_nu;
+}
+
+/* 1 for nodes where p or q is not zero at nu = rate = 0. */
+void im_restless(const implicit *s, uint8_t *flags) {
+  const double zero[K] = {0};
+  for (int64_t a = 0; a < s->nodes; a++) {
+    local o;
+    evaluate(s, a, zero, zero, &o);
+    flags[a] = !at_zero(o.p, K) || !at_zero(o.q, K);
+  }
 }
 
 /* Momentum p(nu, rate) of given rates, integrated: [node][K]. */

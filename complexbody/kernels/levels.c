@@ -8,14 +8,22 @@
  *   positions of the nodes of level l;  f = forces of the cells of level l there, summed over ranks;
  *   q += weight[l] (held + f) where no finer cell acts, else held and q are kept for the next level;
  * and after every second passage of level l, q = q0 + gain (q - q0) with q0 as it was at the first.
- * Needs N, NR, DIAGONAL. */
-#include <stdint.h>
-#include <string.h>
+ *
+ * Cells at rest are not asked for forces. Entries whose range of nodes is not stirred have never had a
+ * force: their q, held and before are the zeros they were made with. Behind quiet.h; needs N, NR,
+ * DIAGONAL. */
 
 #define VN (NR < 8 ? NR : 8)
 typedef double nvec __attribute__((vector_size(8 * VN)));
 #define AT(p, a) ((nvec *)((p) + (int64_t)(a) * NR))
 #define EACH for (int g = 0; g < NR / VN; g++)
+
+/* What lies in a list of entries by level: those of level l and one range of nodes are a part. */
+typedef struct {
+  const int64_t *first;     /* parts of level l are [first[l], first[l + 1]), [levels + 2] */
+  const int64_t *from;      /* [part + 1]: place in the list */
+  const int64_t *range;     /* [part] */
+} parts;
 
 typedef struct {
   int64_t levels, count;
@@ -26,8 +34,7 @@ typedef struct {
   const int32_t *node;      /* [count] */
   double *q, *still;        /* [count][NR]; still: positions at the step's own time */
   double *held, *before;    /* [slot][NR] */
-  const int64_t *own;       /* list[own[l]:own[l + 1]] are the entries of nodes of level l */
-  const int32_t *list;
+  const int32_t *list;      /* entries by the level of their nodes */
   const double *softness;   /* (step^2 / 2) M^-1 per class, 0 where prescribed: [class][NR] or [N][N] */
   const double *inverse_volume;
   const int32_t *klass;     /* or NULL */
@@ -41,15 +48,39 @@ typedef struct {
   const int32_t *driven_entry, *driven_component;
   const double *bend;       /* half the second difference of the motion over a step */
   double *unit;             /* q of a unit force, and at entry of each level: [levels + 2] */
+  const int64_t *number;    /* of each of the chunks, among those of the activity */
+  parts entries, owned;     /* of the entries, and of list */
+  activity *activity;       /* or NULL */
 } octaves;
 
+/* NULL if all act. */
+INLINE activity *quiet(const octaves *o) { return o->activity && o->activity->on ? o->activity : NULL; }
+
+/* Places i in a list, of its parts of levels [l, m), but for quiet ones. */
+#define EACH_OF(o, list, l, m, i)                                                                  \
+  const activity *q_ = quiet(o);                                                                   \
+  for (int64_t p_ = (list)->first[l]; p_ < (list)->first[m]; p_++)                                 \
+    if (!q_ || q_->stirred[(list)->range[p_]])                                                     \
+      for (int64_t i = (list)->from[p_]; i < (list)->from[p_ + 1]; i++)
+
 static void act(const octaves *o, int64_t first, int64_t last) {
-  if (last > first) o->forces(o->state, o->chunks + 4 * first, last - first);
+  activity *q = quiet(o);
+  if (!q && last > first) o->forces(o->state, o->chunks + 4 * first, last - first);
+  for (int64_t i = first; q && i < last; i++) {
+    const int64_t c = o->number[i];
+    if (q->awake[c]) o->forces(o->state, o->chunks + 4 * i, 1); else q->skipped += q->size[c];
+  }
+}
+
+/* Cells of level l that what moves within the step has reached. */
+static void look(const octaves *o, int64_t l) {
+  activity *q = quiet(o);
+  for (int64_t i = o->start[l]; q && i < o->start[l + 1]; i++) look_at(q, o->number[i], o->x, NR);
 }
 
 /* Positions of the nodes of level l, where q has brought them. */
 static void place(const octaves *o, int64_t l) {
-  for (int64_t i = o->own[l]; i < o->own[l + 1]; i++) {
+  EACH_OF(o, &o->owned, l, l + 1, i) {
     const int64_t e = o->list[i], a = o->node[e], k = o->klass ? o->klass[a] : 0;
     const double iv = o->inverse_volume[a];
 #if DIAGONAL
@@ -70,6 +101,7 @@ static void place(const octaves *o, int64_t l) {
     const int64_t e = o->driven_entry[i], c = o->driven_component[i];
     o->x[(int64_t)o->node[e] * NR + c] = o->still[e * NR + c] + o->unit[0] * o->bend[i];
   }
+  look(o, l);
 }
 
 /* Forces have come in: act on the entries that no finer level reaches, keep the others'. */
@@ -77,17 +109,19 @@ static void take(const octaves *o, int64_t l) {
   const int64_t first = o->first[l], next = o->first[l + 1];
   const double w = o->weight[l];
   const double *held = o->held + o->slot[l] * NR;
-  for (int64_t e = first; e < next; e++) {
-    nvec *f = AT(o->f, o->node[e]), *q = AT(o->q, e);
-    const nvec *h = AT(held, e - first);
-    EACH { q[g] += w * (h[g] + f[g]); f[g] = (nvec){0}; }
+  {
+    EACH_OF(o, &o->entries, l, l + 1, e) {
+      nvec *f = AT(o->f, o->node[e]), *q = AT(o->q, e);
+      const nvec *h = AT(held, e - first);
+      EACH { q[g] += w * (h[g] + f[g]); f[g] = (nvec){0}; }
+    }
   }
   if (l == o->levels) {
     o->unit[0] += w;
     return;
   }
   double *below = o->held + o->slot[l + 1] * NR, *before = o->before + o->slot[l + 1] * NR;
-  for (int64_t e = next; e < o->count; e++) {
+  EACH_OF(o, &o->entries, l + 1, o->levels + 1, e) {
     nvec *f = AT(o->f, o->node[e]), *q = AT(o->q, e);
     nvec *b = AT(below, e - next), *q0 = AT(before, e - next);
     const nvec *h = AT(held, e - first);
@@ -96,9 +130,12 @@ static void take(const octaves *o, int64_t l) {
   o->unit[l + 1] = o->unit[0];
 }
 
+/* Forces of the cells of level 0, at this step's own time. */
+void cb_octaves_coarse(const octaves *o) { act(o, o->start[0], o->start[1]); }
+
 /* Before the first leaf: f holds the forces of level 0 and loads, of this step's own time. */
 void cb_octaves_begin(const octaves *o) {
-  for (int64_t e = 0; e < o->count; e++) {
+  EACH_OF(o, &o->entries, 0, o->levels + 1, e) {
     const int64_t a = o->node[e];
     nvec *f = AT(o->f, a), *q = AT(o->q, e), *x0 = AT(o->still, e);
     nvec *h = AT(o->held, e), *q0 = AT(o->before, e);
@@ -122,7 +159,7 @@ void cb_octaves_take(const octaves *o, int64_t l) { take(o, l); }
 void cb_octaves_close(const octaves *o, int64_t l) {
   const int64_t first = o->first[l];
   const double *before = o->before + o->slot[l] * NR, gain = o->gain;
-  for (int64_t e = first; e < o->count; e++) {
+  EACH_OF(o, &o->entries, l, o->levels + 1, e) {
     nvec *q = AT(o->q, e);
     const nvec *q0 = AT(before, e - first);
     EACH q[g] = q0[g] + gain * (q[g] - q0[g]);
@@ -132,7 +169,7 @@ void cb_octaves_close(const octaves *o, int64_t l) {
 
 /* f = the whole step's force, positions as they were. */
 void cb_octaves_end(const octaves *o) {
-  for (int64_t e = 0; e < o->count; e++) {
+  EACH_OF(o, &o->entries, 0, o->levels + 1, e) {
     const int64_t a = o->node[e];
     nvec *f = AT(o->f, a), *x = AT(o->x, a);
     const nvec *q = AT(o->q, e), *x0 = AT(o->still, e);

@@ -38,7 +38,7 @@ class State(ctypes.Structure):
             for name in (
                 "table", "cell", "geometry", "coefficient", "x", "v", "f", "constant", "volume",
                 "inverse_volume", "klass", "alpha", "beta", "eta", "sums", "coordinates", "counted",
-                "forms", "activity",
+                "forms", "activity", "plain",
             )
         ),
     )  # fmt: skip
@@ -140,13 +140,19 @@ class Kernels:
         # Libraries are shared by all scenes of one source: nothing of a scene may be kept in them.
         s.forms = ctypes.addressof(self._records)
         self.n, self.record = n, record
-        self._libraries: dict[tuple[bool, bool], ctypes.CDLL] = {}
+        self._libraries: dict[tuple[bool, bool, bool], ctypes.CDLL] = {}
         self.select(diagonal=True, damped=False)
         self._affine()
 
-    def select(self, diagonal: bool, damped: bool) -> None:
-        """Choose the variant of the node loop: diagonal or block inertia, damping or none."""
-        self._variant = (diagonal, damped)
+    def select(self, diagonal: bool, damped: bool, whole: bool = False) -> None:
+        """Choose the variant of the node loop.
+
+        Args:
+            diagonal: Inertia and damping couple no components.
+            damped: There is damping.
+            whole: Components of u are coupled too, not only those of ν.
+        """
+        self._variant = (diagonal, damped, whole)
 
     @property
     def c(self) -> ctypes.CDLL:
@@ -161,7 +167,7 @@ class Kernels:
             self._libraries[key] = library
         return self._libraries[key]
 
-    def source(self, diagonal: bool, damped: bool) -> str:
+    def source(self, diagonal: bool, damped: bool, whole: bool = False) -> str:
         """C source of the scene's library."""
         disc, scene = self.disc, self.action.scene
         d = self.densities
@@ -169,6 +175,7 @@ class Kernels:
             "N": disc.n, "NU": scene.displacement, "NR": disc.record, "W": disc.lanes,
             "DIM": disc.dim, "GEOMETRY": disc.dim**2 + 1, "COEFFICIENTS": len(d.coefficients),
             "DIAGONAL": int(diagonal), "DAMPED": int(damped),
+            "COUPLED": 0 if whole else scene.displacement,
         }  # fmt: skip
         parts = [f"#define {k} {v}" for k, v in defines.items()]
         files = ("vectors.h", "tabulated.h", "quiet.h")
@@ -266,7 +273,7 @@ class Kernels:
         vector = np.zeros(len(action.q.x.array))
         fem.assemble_vector(vector, _compat.form(ufl.derivative(total, action.q, action.v)))
         self.constant = native.aligned(self.f.shape)
-        self.constant[:-1, : self.n] = -self.disc.gather(vector.reshape(-1, self.n))
+        self.constant[:-1, : self.n] = -self.disc.gather_sum(vector.reshape(-1, self.n))
         self.state.constant = self.constant.ctypes.data
 
     def reset_forces(self) -> None:

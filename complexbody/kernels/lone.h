@@ -26,13 +26,16 @@ __attribute__((unused)) static void soften_node(const world *s, int64_t a, doubl
 /* The same for W nodes. */
 INLINE void soften(const world *s, const int32_t *c, const vec soft, const vec f[NR], vec q[NR]) {
 #if SLOW
-  for (int l = 0; l < W; l++) {
-    double force[N], at[N];
-    for (int i = 0; i < N; i++) force[i] = f[i][l], at[i] = q[i][l];
-    soften_node(s, c[l], soft[l], force, at);
-    for (int i = 0; i < N; i++) q[i][l] = at[i];
+  if (!all_plain(s, c)) {
+    for (int l = 0; l < W; l++) {
+      double force[N], at[N];
+      for (int i = 0; i < N; i++) force[i] = f[i][l], at[i] = q[i][l];
+      soften_node(s, c[l], soft[l], force, at);
+      for (int i = 0; i < N; i++) q[i][l] = at[i];
+    }
+    return;
   }
-#else
+#endif
   vec inverse;
   for (int l = 0; l < W; l++) inverse[l] = c[l] < s->nodes ? record_of(s, c[l])[INVERSE] : 0.0;
   inverse *= soft;
@@ -45,7 +48,6 @@ INLINE void soften(const world *s, const int32_t *c, const vec soft, const vec f
     for (int l = 0; l < W; l++) m[l] = s->inverse_mass[s->klass[c[l]] * NR + i];
     q[i] += m * inverse * f[i];
   }
-#endif
 }
 
 /* Forces of up to W cells of a density that is not quadratic, each at its own time. */
@@ -61,6 +63,7 @@ __attribute__((unused)) static void tabulated_lone(const tabulated *force, const
   for (int l = 0; l < count; l++) {
     tabulated one = *force; /* this cell's pack where lane l's would be */
     one.pack += (cell[l] - l) * (force->before + force->after);
+    if (one.corners) one.corners += 3 * (DIM + 1) * (int64_t)(cell[l] - l);
     tabulated_input(&one, 0, l, c, s->record, RECORD, s->coordinates, w, at);
     for (int pass = 0; pass <= CORRECTED; pass++) {
       memset(f, 0, sizeof f);

@@ -5,6 +5,11 @@
  * a range is `stirred` if a chunk that touches it is awake, or something else acts on its nodes. Only
  * chunks with nodes in stirred ranges, `near` ones, can find a node that is not at zero. Nothing goes
  * back to sleep. What is skipped would add zero to sums: no bit changes. */
+#include <stdint.h>
+#include <string.h>
+#ifndef INLINE
+#define INLINE static inline __attribute__((always_inline))
+#endif
 
 typedef struct {
   int64_t on;                 /* 0 once nearly all chunks are awake: nothing is skipped any more */
@@ -45,6 +50,16 @@ static void wake(activity *q, int64_t c) {
   q->awake_cells += q->size[c];
   for (int64_t i = q->range_from[c]; i < q->range_from[c + 1]; i++) stir(q, q->range[i]);
   if (q->awake_cells > ENOUGH * q->cells) q->on = 0;
+}
+
+/* Wake chunk c if it is near and a node of it is not at zero in x, [node][size]. */
+__attribute__((unused)) static void look_at(activity *q, int64_t c, const double *x, int size) {
+  if (q->awake[c] || !q->near[c]) return;
+  for (int64_t i = q->node_from[c]; i < q->node_from[c + 1]; i++)
+    if (!at_zero(x + (int64_t)q->node[i] * size, size)) {
+      wake(q, c);
+      return;
+    }
 }
 
 /* For the start: what acts on nodes stirs their ranges, and some chunks are awake from then on. */

@@ -10,6 +10,7 @@ typedef struct {
   int64_t before, after;   /* doubles of w before and behind the unknowns */
   int64_t unknowns;        /* 1 if w holds the unknowns */
   const double *pack;      /* [block][lane][before + after] */
+  const double *corners;   /* [block][lane][vertex][3] where nodes do not say where cells are, or NULL */
   const double *constants;
 } tabulated;
 
@@ -24,7 +25,8 @@ INLINE void tabulated_input(const tabulated *t, int64_t block, int l, const int3
   memcpy(w, pack, t->before * sizeof(double));
   for (int a = 0; a <= DIM; a++) {
     const int64_t node = c[a * W + l];
-    memcpy(at + 3 * a, coordinates + 3 * node, 3 * sizeof(double));
+    memcpy(at + 3 * a, t->corners ? t->corners + 3 * ((block * W + l) * (DIM + 1) + a)
+                                  : coordinates + 3 * node, 3 * sizeof(double));
     if (t->unknowns) memcpy(q + a * N, x + node * stride, N * sizeof(double));
   }
   memcpy(q + (t->unknowns ? LOCAL : 0), pack + t->before, t->after * sizeof(double));

@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 from dense import Plain, element_matrices, hessian_of, square
 
+import complexbody as cb
 from complexbody import meshes
 
 
@@ -65,3 +66,15 @@ def lattice_step(body, size, q, h, scheme="exact"):
         x[plain.light] += 0.5 * h * plain.mobility @ force[plain.light]
         columns.append(np.concatenate([x, plain.rate(-K @ x)[heavy]]))
     return np.array(columns).T, heavy
+
+
+def chiral(dim):
+    """Two fields whose values and gradients are coupled: K_h(q) is complex."""
+
+    def energy(U, nu, N):
+        squares = 1.1 * U[0, 0] ** 2 + 0.4 * N[0, 0] ** 2 + 0.8 * nu[0] ** 2
+        if dim > 1:
+            squares += 0.7 * U[0, 1] ** 2 + 0.5 * N[0, 1] ** 2 + 0.3 * U[0, 1] * N[0, 0]
+        return squares + 0.5 * nu[0] * U[0, 0] + (-0.6 * nu[0] * U[0, 1] if dim > 1 else 0.0)
+
+    return cb.Body(1, energy, 1.2, 0.7, displacement=1, name=f"chiral {dim}D")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from dense import prepared, state, whole
-from verification.lattice import lattice_mesh, lattice_stiffness
+from verification.lattice import chiral, lattice_mesh, lattice_stiffness
 
 import complexbody as cb
 from complexbody.forms import (
@@ -19,19 +19,6 @@ from complexbody.forms import (
     isotropic_two_field,
     scaled_icosahedral_quasicrystal,
 )
-
-
-def chiral(dim):
-    """Two fields whose values and gradients are coupled: K_h(q) is complex."""
-
-    def energy(U, nu, N):
-        squares = 1.1 * U[0, 0] ** 2 + 0.4 * N[0, 0] ** 2 + 0.8 * nu[0] ** 2
-        if dim > 1:
-            squares += 0.7 * U[0, 1] ** 2 + 0.5 * N[0, 1] ** 2 + 0.3 * U[0, 1] * N[0, 0]
-        return squares + 0.5 * nu[0] * U[0, 0] + (-0.6 * nu[0] * U[0, 1] if dim > 1 else 0.0)
-
-    return cb.Body(1, energy, 1.2, 0.7, displacement=1, name=f"chiral {dim}D")
-
 
 SCALED = {"C44": 1.0, "K2": 0.6, "R3": 0.4, "density": 1.0, "inertia": 0.8, "viscosity": 0.0}
 CASES = {
