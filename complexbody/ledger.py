@@ -176,7 +176,7 @@ class Bookkeeper:
         raise error
 
     def _bound(self) -> float:
-        """What was ever put in: initial energies, works, and what stored, potential and χ(ν, 0) gave away.
+        """What was ever put in: initial energies, works, what stored, potential, χ(ν, 0) gave away.
 
         Losses do not count: where a step is too large they grow with the energy from nowhere.
         """

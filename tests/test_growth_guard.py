@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""The guard on energy from nowhere: silent where little or nothing is put in, not where runs blow."""
+"""The guard on energy from nowhere: silent where little is put in, not where runs blow up."""
 
 from dataclasses import replace
 
