@@ -129,13 +129,14 @@ class ImplicitRun(ForceRun):
                 before = 0.0 if half else 0.5
                 kernels.sums[4] += self._support_work(kernels.v, before)
                 kernels.sums[4] += self._support_work(self.next, 1.0 - before)
+            # So do loads: half of the mean rate, whose work is exact for a constant inertia.
+            kick = 0.25 * h if half else 0.5 * h
+            amplitude = self.amplitude(self.time)
+            kernels.sums[3] += kick * problem.load_power(amplitude, kernels.v)
             self.solver.commit()
             if self.activity is not None:
                 kernels.c.cb_look(self.state)
-            if len(problem.load_value):
-                for t in (self.time, self.time + h):
-                    power = problem.load_power(self.amplitude(t), kernels.v)
-                    kernels.sums[3] += 0.5 * h * power
+            kernels.sums[3] += kick * problem.load_power(amplitude, kernels.v)
             kernels.reset_forces()
             self.steps += 1
             self.ready = False
@@ -247,11 +248,16 @@ class ImplicitRun(ForceRun):
         common["kinetic_nu"] = self.solver.kinetic(rates)
         self._measure(rates)
         work, support, lost = float(sums[3]), float(sums[4]) + self.support_work, float(sums[0])
+        if self.steps:
+            # The half kick before t_n, which order 1 has not.
+            both = problem.kernels.v + rates
+            work += 0.5 * self.s * self.step * problem.load_power(self.amplitude(self.time), both)
+        still = self.solver.kinetic(np.zeros_like(rates)) if problem.convexity is not None else 0.0
         energy = sum(common[n] for n in ("kinetic_u", "kinetic_nu", "stored", "potential"))
         return Entries(
             **common, work=work, support_work=support, dissipated=lost,
             surplus=energy - work - support + lost, discrete=0.0, flows=0.0, size=0.0,
-            variation_u=float(sums[1]), variation_nu=float(sums[2]),
+            variation_u=float(sums[1]), variation_nu=float(sums[2]), still=still,
         )  # fmt: skip
 
     def _measure(self, rates: Array) -> None:
