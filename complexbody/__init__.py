@@ -9,6 +9,7 @@ dissipation: variational integrators and convergence* ("the paper" in docstrings
 
 from complexbody import rotations
 from complexbody.body import Body
+from complexbody.checkpoint import Checkpoint
 from complexbody.densities import deformation
 from complexbody.derived import derived_fields
 from complexbody.dispersion_picture import plot_dispersion
@@ -52,6 +53,7 @@ __all__ = [
     "Body",
     "BodyForce",
     "Chart",
+    "Checkpoint",
     "ComplexBodyError",
     "Fix",
     "Implicit",

@@ -6,9 +6,11 @@ Everything is probed with ``hasattr``; no other file may ask for a version.
 
 from __future__ import annotations
 
+import ctypes
 import inspect
 import itertools
 import logging
+import os
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,6 +29,28 @@ for _handler in logging.getLogger().handlers:
 
 Array = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
+
+
+def steady_partitions() -> None:
+    """Let Scotch cut a mesh as it did in the last process that made the same meshes.
+
+    It draws random numbers from the clock, and its threads race: each run would have other parts,
+    and other last bits. Does nothing where dolfinx has no Scotch.
+    """
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
+    try:
+        with open("/proc/self/maps") as maps:
+            loaded = {line.split()[-1] for line in maps if "/libscotch-" in line}
+    except OSError:
+        return
+    for path in loaded:
+        library = ctypes.CDLL(path)
+        if hasattr(library, "SCOTCH_randomSeed") and hasattr(library, "SCOTCH_randomReset"):
+            library.SCOTCH_randomSeed(ctypes.c_int64(1))
+            library.SCOTCH_randomReset()
+
+
+steady_partitions()
 
 #: Options for every FFCx compilation: the flags matter more than who loops (measured).
 JIT_OPTIONS: dict[str, Any] = {

@@ -20,7 +20,7 @@ from typing import Any, NoReturn
 from mpi4py import MPI
 
 from complexbody import __version__, cli_chart, cli_plan, cli_show, cli_stability, commands
-from complexbody.cli_texts import EPILOG, RUN_EPILOG
+from complexbody.cli_texts import EPILOG, RESUME_EPILOG, RUN_EPILOG
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.integrators.asynchronous import SCHEDULES
 from complexbody.integrators.petsc_ts import FORMS
@@ -82,6 +82,15 @@ def parser() -> argparse.ArgumentParser:
         help="choose integrator and step, by short runs, for this relative error at the end",
     )  # fmt: skip
     _output(run)
+    _checkpoints(run)
+    again = command(
+        "resume", commands.resume, "go on with a run that was stopped, from its newest checkpoint",
+        RESUME_EPILOG,
+    )  # fmt: skip
+    again.add_argument("folder", metavar="DIR", help="the folder of the run's results")
+    again.add_argument("--until", metavar="T", type=float, help="a later end of the run [s]")
+    again.add_argument("--no-picture", action="store_true", help="do not draw")
+    again.add_argument("--quiet", action="store_true", help="print only warnings and errors")
     check = command(
         "check", commands.check,
         "build everything without running, and say what run would do: is the energy coercive, "
@@ -235,6 +244,20 @@ def _output(to: argparse.ArgumentParser) -> None:
     group.add_argument("--quiet", action="store_true", help="print only warnings and errors")
 
 
+def _checkpoints(to: argparse.ArgumentParser) -> None:
+    group = to.add_argument_group("checkpoints (DIR/checkpoints; complexbody resume DIR goes on)")
+    group.add_argument(
+        "--checkpoint-every", metavar="S", type=float,
+        help="wall time between two [s]; default 600, 0 for none at all",
+    )  # fmt: skip
+    group.add_argument(
+        "--checkpoint-steps", metavar="N", type=int, help="steps between two, beside that time"
+    )
+    group.add_argument(
+        "--checkpoint-keep", metavar="N", type=int, help="how many are kept; default 2"
+    )
+
+
 @contextmanager
 def _warnings(comm: Any) -> Iterator[None]:
     """Show warnings as one line each, on rank 0."""
@@ -263,7 +286,7 @@ def _parsed(words: list[str]) -> argparse.Namespace | None:
         arguments = parser().parse_args(words)
     except SystemExit:
         return None
-    arguments.words = words
+    arguments.words, arguments.parse = words, parser().parse_args
     return arguments
 
 
@@ -296,6 +319,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     # PETSc's handler makes a crash of a reader that has left ("complexbody … | head").
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    # It asks a run for a checkpoint; before and after it there is none to make.
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
     comm = MPI.COMM_WORLD
     # Apart from messages of scenes and simulations, which an error may cut off.
     ranks, last = comm.Dup(), comm.Dup()

@@ -22,9 +22,10 @@ from typing import Any
 
 from mpi4py import MPI
 
-from complexbody import machine, precheck, report
+from complexbody import machine, precheck, report, statefile
 from complexbody.accuracy import Accurate
-from complexbody.errors import CommandError, MissingPackage
+from complexbody.checkpoint import Checkpoint
+from complexbody.errors import CheckpointError, CommandError, MissingPackage
 from complexbody.files import on_first_rank
 from complexbody.given import is_positive, is_whole, short
 from complexbody.integrators.asynchronous import AVI
@@ -38,6 +39,7 @@ from complexbody.precheck import realised_speed_up
 from complexbody.problem import Problem
 from complexbody.rendering import require_vtk
 from complexbody.result import Result
+from complexbody.runfolder import recorded_words
 from complexbody.scene import Scene
 from complexbody.scenefile import CheckFailed, SceneFile, assignments, points
 from complexbody.simulate import Simulation, default_ledger_steps
@@ -168,9 +170,24 @@ def _method(settings: Mapping[str, Any]) -> tuple[str, Any]:
     return name, kind(**options)
 
 
+def resume(a: argparse.Namespace, ranks: Any) -> None:
+    """``complexbody resume``: go on with the run of a folder."""
+    with together(ranks):
+        words, path = recorded_words(Path(a.folder))
+    if a.until is not None:
+        words += ["--until", repr(a.until)]
+    for option in ("quiet", "no_picture", "debug"):
+        if getattr(a, option):
+            words.append("--" + option.replace("_", "-"))
+    again = a.parse(words)
+    again.words, again.file, again.out, again.resume = words, path, a.folder, True
+    run(again, ranks)
+
+
 def run(a: argparse.Namespace, ranks: Any) -> None:
     """``complexbody run``: simulate, check, draw, and write down what was done."""
     job = job_of(a, ranks)
+    resumes = bool(getattr(a, "resume", False))
     until = job.until
     if until is None:
         raise CommandError(
@@ -184,17 +201,22 @@ def run(a: argparse.Namespace, ranks: Any) -> None:
         progress = False if a.quiet else None
         options: dict[str, Any] = {
             "until": until, "output": output, "ledger_steps": job.ledger_steps, "growth": growth,
-            "progress": progress, "plan": not a.no_plan,
+            "progress": progress, "plan": not a.no_plan, "checkpoint": _checkpoint(a, job),
         }  # fmt: skip
-        if job.accuracy is None:
-            runner: Any = Simulation(job.scene, job.method, **options)
-            simulation, name = runner, job.name
+        if job.accuracy is None or resumes:
+            # What an accuracy has chosen goes on, without being looked at again.
+            name, method = job.name, job.method
+            if job.accuracy is not None:
+                name, method = _chosen(output)
+            runner: Any = Simulation(job.scene, method, **options, resume=resumes)
+            simulation = runner
         else:
             runner = Accurate(job.scene, job.accuracy, **options)
             simulation = runner.simulation
             name = next(n for n, kind in INTEGRATORS.items() if kind is type(simulation.method))
     if not a.quiet:
         say(ranks, *report.before(simulation, name, simulation.method, output, until))
+        say(ranks, *report.resumed(simulation))
     with _recorded(a, job, output, ranks) as done:
         with together(ranks):
             result = runner.run()
@@ -215,6 +237,40 @@ def run(a: argparse.Namespace, ranks: Any) -> None:
             raise failure
     if not a.quiet:
         say(ranks, report.entry("files", str(output.folder)))
+
+
+def _checkpoint(a: argparse.Namespace, job: Job) -> Checkpoint | None:
+    """When to make checkpoints, by the options."""
+    given = a.checkpoint_every, a.checkpoint_steps, a.checkpoint_keep
+    if a.checkpoint_every == 0 and a.checkpoint_steps is None:
+        return None
+    if job.name == "petsc-ts" and given == (None, None, None):
+        return None  # it can make none
+    every = 600.0 if a.checkpoint_every is None else a.checkpoint_every or None
+    return Checkpoint(every, a.checkpoint_steps, 2 if given[2] is None else given[2])
+
+
+def _chosen(output: Output) -> tuple[str, Any]:
+    """The integrator of a folder's newest checkpoint, by name and made; rank 0's word counts.
+
+    Raises:
+        CheckpointError: if there is none.
+    """
+    told: tuple[str, Any] | CheckpointError = CheckpointError("No checkpoint. Run it anew.")
+    if MPI.COMM_WORLD.rank == 0:
+        for path in statefile.listed(Checkpoint().place(output)):
+            try:
+                kind = statefile.read(path)[0]["integrator"]
+            except CheckpointError as error:
+                told = error
+                continue
+            name = next(n for n, k in INTEGRATORS.items() if k.__name__ == kind["class"])
+            told = name, INTEGRATORS[name](**kind["options"])
+            break
+    told = MPI.COMM_WORLD.bcast(told)
+    if isinstance(told, CheckpointError):
+        raise told
+    return told
 
 
 def _checked(
@@ -264,6 +320,7 @@ def _recorded(
     kept: list[report.Record] = []
     values = {
         "command": shlex.join(["complexbody", *a.words]),
+        "words": list(a.words),
         "scene": job.scene.name,
         "file": str(job.file.path.resolve()),
         "sha256": hashlib.sha256(job.file.path.read_bytes()).hexdigest(),
@@ -282,7 +339,10 @@ def _recorded(
         told = error if isinstance(error, Exception) else f"{type(error).__name__}: {error}"
         state = str(error) if isinstance(error, Interrupted) else f"failed: {told}"
         if isinstance(error, Interrupted):
-            error.args = (f"{error}; what was written until then is in {output.folder}",)
+            told = f"{error}; what was written until then is in {output.folder}"
+            if statefile.listed(Checkpoint().place(output)):
+                told += f", and complexbody resume {output.folder} goes on"
+            error.args = (told,)
         raise
     finally:
         # Not collective: after a signal the ranks need not meet again.

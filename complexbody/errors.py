@@ -56,6 +56,12 @@ class OutputError(ComplexBodyError, OSError):
     """Results cannot be written where the user asked."""
 
 
+class CheckpointError(ComplexBodyError):
+    """A run cannot be resumed: no checkpoint is whole, or of this scene; or none can be made."""
+
+    exit_code = 6
+
+
 class ResultsError(ComplexBodyError, ValueError):
     """A folder does not have the results that are asked for, or they cannot be read."""
 

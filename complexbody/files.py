@@ -1,46 +1,25 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
-"""Files that grow with a run: a field's steps for ParaView and meshio, and tables of numbers.
+"""Files that survive whatever happens to who writes them: replaced in one go, or only added to.
 
-They are complete after every step: HDF5 files are open only while rank 0 appends to them, and their
-XDMF index is then replaced in one go. A run killed between steps loses nothing, and whoever looks
-at the files meanwhile disturbs nothing. Knows a mesh, but no scene, and no field but numbers.
+A file that is there is complete at any moment, be the process killed or the disk full. Knows bytes
+and tables of numbers, and no mesh.
 """
 
 from __future__ import annotations
 
 import csv
-import math
-import shutil
+import errno
+import io
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 
-from complexbody import _compat
-from complexbody._compat import Array, Ints
-from complexbody.errors import ComplexBodyError, MissingPackage, OutputError, agree
+from complexbody.errors import ComplexBodyError, OutputError, agree
 
-_TOPOLOGY = {2: "Polyline", 3: "Triangle", 4: "Tetrahedron"}
-_ATTRIBUTE = {1: "Scalar", 3: "Vector", 9: "Tensor"}
-SLACK = 1 << 16  # bytes that a step may take besides its values
-_ANOTHER = "Resume in the folder of the run that the checkpoint comes from, or give a new folder."
-
-_HEAD = """<?xml version="1.0"?>
-<Xdmf Version="3.0"><Domain><Grid Name="{name}" GridType="Collection" CollectionType="Temporal">
-"""
-# Each step names the mesh: beside a mesh of its own the series would be one of several blocks.
-_STEP = """<Grid Name="{name}" GridType="Uniform"><Time Value="{time!r}"/>
-{mesh}
-<Attribute Name="{name}" AttributeType="{kind}" Center="{center}">
-{values}</Attribute></Grid>
-"""
-_MESH = """<Topology TopologyType="{kind}" NumberOfElements="{cells}" NodesPerElement="{corners}">
-{topology}</Topology>
-<Geometry GeometryType="XYZ">
-{geometry}</Geometry>"""
-_TAIL = "</Grid></Domain></Xdmf>\n"
+ANOTHER = "Resume in the folder of the run that the checkpoint comes from, or give a new folder."
 
 
 def on_first_rank(comm: Any, path: Path, task: Callable[[], None], hdf5: bool = False) -> None:
@@ -67,124 +46,41 @@ def on_first_rank(comm: Any, path: Path, task: Callable[[], None], hdf5: bool = 
         raise agreed from cause
 
 
-def in_input_order(domain: Any) -> tuple[tuple[Array, Ints], tuple[Ints, Ints]]:
-    """The mesh on rank 0, collective.
+def replace(path: Path, content: bytes | memoryview) -> None:
+    """Write a file so that at any moment, whatever kills the process, it is the old or the new one.
 
-    Returns:
-        Points (nodes, 3) and cells (cells, d+1) in the order of the mesh's input; and which of the
-        nodes, and of the cells, gathered rank by rank, is the first, second, …
-    """
-    nodes, cells = _compat.node_map(domain), _compat.cell_count(domain)[0]
-    parts = domain.comm.gather(
-        (
-            np.asarray(domain.geometry.input_global_indices)[: nodes.size_local],
-            _compat.original_cells(domain)[:cells],
-            domain.geometry.x[: nodes.size_local],
-            nodes.local_to_global(_compat.cell_nodes(domain)[:cells].ravel()),
-        )
-    )
-    if parts is None:
-        return (np.zeros((0, 3)), np.zeros((0, 0), np.int32)), (np.zeros(0, np.int32),) * 2
-    gathered = (np.concatenate(part) for part in zip(*parts, strict=True))
-    numbers, cell_numbers, points, corners = gathered
-    order, cell_order = np.argsort(numbers), np.argsort(cell_numbers)
-    place = np.empty(len(order), dtype=np.int32)
-    place[order] = np.arange(len(order))
-    table = place[corners].reshape(len(cell_order), -1)[cell_order]
-    return (points[order], table), (order, cell_order)
-
-
-def _h5py() -> Any:
-    try:
-        import h5py
-    except ImportError:
-        raise MissingPackage("Output: no h5py. Run: apt-get install python3-h5py") from None
-    return h5py
-
-
-class Series:
-    """The steps of one field: ``<path>.h5`` and its index ``<path>.xdmf``; for one process.
-
-    Args:
-        path: The files, without their endings.
-        name: What ParaView calls the field.
-        center: "Node" or "Cell".
-        points: Nodes (nodes, 3).
-        cells: Node numbers of cells (cells, d+1).
-        resume: Keep the steps up to this time [s] that an earlier run wrote; None keeps none.
+    What is to survive the computer as well needs :func:`settle`, which takes its time.
 
     Raises:
-        OutputError: if the steps to be kept are on another mesh.
-        OSError: if the files cannot be written.
+        OSError: if the file system refuses; the old file is as it was.
     """
+    draft = path.with_name(path.name + ".part")
+    try:
+        with draft.open("wb", buffering=0) as file:
+            view = memoryview(content)
+            while len(view):
+                view = view[file.write(view) :]
+        draft.replace(path)
+    except OSError:
+        draft.unlink(missing_ok=True)
+        raise
 
-    def __init__(
-        self, path: Path, name: str, center: str, points: Array, cells: Ints, resume: float | None
-    ) -> None:
-        h5py = _h5py()
-        self._index, self._data = (path.with_name(path.name + end) for end in (".xdmf", ".h5"))
-        self._name, self._center, self._last = name, center, -math.inf
-        self._steps: list[str] = []
-        # The lock would let a reader of an earlier step stop the run.
-        with h5py.File(self._data, "w" if resume is None else "a", locking=False) as file:
-            if "Mesh" not in file:
-                file["Mesh/mesh/geometry"], file["Mesh/mesh/topology"] = points, cells
-            elif not np.array_equal(file["Mesh/mesh/topology"], cells):
-                raise OutputError(f"Output: {self._data} has results on another mesh. {_ANOTHER}")
-            self._mesh = _MESH.format(
-                kind=_TOPOLOGY[cells.shape[1]],
-                cells=len(cells),
-                corners=cells.shape[1],
-                topology=self._item(file["Mesh/mesh/topology"]),
-                geometry=self._item(file["Mesh/mesh/geometry"]),
-            )
-            steps = file.require_group(f"Function/{name}")
-            for number in sorted(steps, key=int):
-                # A run that was killed may have left a step without a time.
-                if resume is not None and steps[number].attrs.get("time", math.inf) <= resume:
-                    self._enter(steps[number])
-                else:
-                    del steps[number]
-        self._save()
 
-    def append(self, time: float, values: Array) -> None:
-        """Add the values (rows, components) at ``time`` [s], unless the file is as far already."""
-        if time <= self._last:
-            return
-        # HDF5 does not survive a full disk: the process would crash at its end.
-        if shutil.disk_usage(self._data.parent).free < values.nbytes + SLACK:
-            raise OSError("No space left on device")
-        with _h5py().File(self._data, "a", locking=False) as file:
-            data = file.create_dataset(f"Function/{self._name}/{len(self._steps)}", data=values)
-            data.attrs["time"] = time
-            self._enter(data)
-        self._save()
+def settle(*paths: Path) -> None:
+    """See that files or folders are on the disk.
 
-    def _item(self, data: Any) -> str:
-        (rows, columns), kind = data.shape, {"i": "Int", "f": "Float"}[data.dtype.kind]
-        return (
-            f'<DataItem Dimensions="{rows} {columns}" NumberType="{kind}" Format="HDF" '
-            f'Precision="{data.dtype.itemsize}">{self._data.name}:{data.name}</DataItem>'
-        )
-
-    def _enter(self, data: Any) -> None:
-        self._last = float(data.attrs["time"])
-        self._steps.append(
-            _STEP.format(
-                name=self._name,
-                mesh=self._mesh,
-                time=self._last,
-                kind=_ATTRIBUTE.get(data.shape[1], "Matrix"),
-                center=self._center,
-                values=self._item(data),
-            )
-        )
-
-    def _save(self) -> None:
-        """Replace the index: readers see the old one or the new one, never a part."""
-        draft, head = self._index.with_suffix(".part"), _HEAD.format(name=self._name)
-        draft.write_text("".join([head, *self._steps, _TAIL]), encoding="utf-8")
-        draft.replace(self._index)
+    Raises:
+        OSError: if they cannot be.
+    """
+    for path in paths:
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # folders of some network file systems
+                raise
+        finally:
+            os.close(handle)
 
 
 class CsvWriter:
@@ -209,6 +105,8 @@ class CsvWriter:
     ) -> None:
         self.path, self._comm = Path(path), comm
         self._file: Any = None
+        #: Rows of an earlier run that are kept, on rank 0.
+        self.kept: list[list[float]] = []
         header = [f"{name} [{unit}]" if unit else name for name, unit in columns.items()]
 
         def start() -> None:
@@ -218,14 +116,13 @@ class CsvWriter:
                 with self.path.open(newline="", encoding="utf-8") as file:
                     found, *kept = csv.reader(file)
                 if found != header:
-                    raise OutputError(f"Output: {self.path} has other columns. {_ANOTHER}")
+                    raise OutputError(f"Output: {self.path} has other columns. {ANOTHER}")
                 # A run that was killed may have left a part of a row.
                 kept = [row for row in kept if len(row) == len(header)]
                 kept = [row for row in kept if float(row[0]) <= resume]
-            draft = self.path.with_name(self.path.name + ".part")
-            self._file = draft.open("w", newline="", encoding="utf-8")
-            self._rows([header, *kept])
-            draft.replace(self.path)
+            self.kept = [[float(value) for value in row] for row in kept]
+            replace(self.path, _lines([header, *kept]))
+            self._file = self.path.open("ab", buffering=0)
 
         on_first_rank(comm, self.path, start)
 
@@ -234,8 +131,17 @@ class CsvWriter:
         on_first_rank(self._comm, self.path, lambda: self._rows(rows))
 
     def _rows(self, rows: Iterable[Sequence[Any]]) -> None:
-        csv.writer(self._file, lineterminator="\n").writerows(rows)
-        self._file.flush()
+        view, size = memoryview(_lines(rows)), self._file.seek(0, os.SEEK_END)
+        try:
+            while len(view):
+                view = view[self._file.write(view) :]
+        except OSError:
+            self._file.truncate(size)  # no part of a row stays
+            raise
+
+    def sync(self) -> None:
+        """See that all rows last, even if the computer does not; collective."""
+        on_first_rank(self._comm, self.path, lambda: os.fsync(self._file.fileno()))
 
     def close(self) -> None:
         """Close the file; nothing is lost without it."""
@@ -247,3 +153,9 @@ class CsvWriter:
 
     def __exit__(self, *exception: object) -> None:
         self.close()
+
+
+def _lines(rows: Iterable[Sequence[Any]]) -> bytes:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()

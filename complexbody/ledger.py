@@ -15,7 +15,7 @@ the largest energy.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
 import numpy as np
@@ -88,6 +88,7 @@ class Bookkeeper:
         self.ledger = Ledger(problem.whole.displacement, self._axes)
         self._start: float | None = None
         self._put = 0.0
+        self._still: tuple[float, float] = 0.0, 0.0
         self._reference: float | None = None
         self._size = 1e-300
         self._orientation = guards.Orientation(problem)
@@ -104,7 +105,8 @@ class Bookkeeper:
         e = Entries.from_array(self.problem.comm.allreduce(run.entries().array()))
         energy = e.kinetic_u + e.kinetic_nu + e.stored + e.potential
         if self._start is None:
-            self._start = energy
+            self._start, self._still = energy, (e.still, e.still)
+        self._still = self._still[0], e.still
         given = e.work + e.support_work - e.dissipated
         identity = 0.0
         if run.steps > 0 and e.size > 0:
@@ -126,6 +128,16 @@ class Bookkeeper:
         self.ledger.rows.append([float(v) for v in row])
         self._guard(e.surplus - self._start if run.steps > 0 else 0.0)
         return self.ledger.rows[-1]
+
+    def state(self) -> dict[str, float | None]:
+        """What later rows depend on besides the run."""
+        return {name: getattr(self, f"_{name}") for name in ("start", "put", "reference", "size")}
+
+    def restore(self, state: Mapping[str, float | None], rows: Array) -> None:
+        """Go on from a state and the rows so far (rows, columns)."""
+        for name, value in state.items():
+            setattr(self, f"_{name}", value)
+        self.ledger.rows[:] = rows.tolist()
 
     def _guard(self, excess: float) -> None:
         run, problem = self.run, self.problem
@@ -174,12 +186,12 @@ class Bookkeeper:
         raise error
 
     def _bound(self) -> float:
-        """What was ever put in: initial energies, works, and what stored and potential gave away.
+        """What was ever put in: initial energies, works, what stored, potential, χ(ν, 0) gave away.
 
         Losses do not count: where a step is too large they grow with the energy from nowhere.
         """
         first, row = self.ledger.rows[0], self.ledger.rows[-1]
-        given = first[3] + first[4] - row[3] - row[4]
+        given = first[3] + first[4] + self._still[0] - row[3] - row[4] - self._still[1]
         initial = sum(abs(v) for v in first[1:5])
         self._put = max(self._put, initial, abs(row[5]), abs(row[6]), given, 1e-300)
         return self._put

@@ -57,7 +57,7 @@ def live(scene: Scene, supports: Any, loads: Any, start: tuple[Array, Array]) ->
     Args:
         scene: The scene.
         supports: Its :class:`complexbody.boundary.Supports`.
-        loads: Its :class:`complexbody.boundary.Loads`.
+        loads: Its :class:`complexbody.loading.Loads`.
         start: Initial fields and rates (geometry nodes, n).
     """
     n = scene.components

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """What leaves a run: which fields, when and where, and what is derived from them per cell.
 
-Each field has an XDMF index beside an HDF5 file, with nodes and cells in the order of the mesh's
+Each field has an XDMF index beside HDF5 files, with nodes and cells in the order of the mesh's
 input: the files do not depend on the number of ranks. ``dolfinx.io.XDMFFile`` could not write them:
 dolfinx 0.5 takes vectors and tensors per cell for nodal values in one and two dimensions. Knows no
 time stepping, and writes only what it is given.
@@ -22,9 +22,10 @@ from complexbody._compat import Array
 from complexbody.action import Action
 from complexbody.derived import CELL_FIELDS, NODAL_FIELDS, Derived
 from complexbody.errors import OutputError, SceneError
-from complexbody.files import CsvWriter, Series, in_input_order, on_first_rank
+from complexbody.files import CsvWriter, on_first_rank, settle
 from complexbody.given import is_finite, is_positive, is_whole, numbers, short
 from complexbody.probes import Probes
+from complexbody.series import Series, in_input_order
 
 __all__ = ["CELL_FIELDS", "NODE_FIELDS", "STEP_FIELDS", "CsvWriter", "Output", "Probes", "Writer"]
 
@@ -208,6 +209,16 @@ class Writer:
                 self._series[name].append(time, table)
 
         on_first_rank(self._comm, self._folder, append, hdf5=True)
+
+    def sync(self) -> None:
+        """See that what was written lasts, even if the computer does not; collective."""
+
+        def sync() -> None:
+            for series in self._series.values():
+                series.sync()
+            settle(self._folder)
+
+        on_first_rank(self._comm, self._folder, sync)
 
     def close(self) -> None:
         """Do nothing: the files are complete after each step."""

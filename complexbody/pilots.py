@@ -31,10 +31,10 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody.boundary import Loads
 from complexbody.errors import ComplexBodyError
 from complexbody.histories import Constant
 from complexbody.integrators.entries import Run
+from complexbody.loading import Loads
 from complexbody.problem import Problem
 from complexbody.scene import Scene
 from complexbody.timesets import cell_densities

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from complexbody import _compat, boundary, native
+from complexbody import _compat, boundary, loading, native
 from complexbody.action import Action
 from complexbody.assumptions import check_energy, hessian_samples
 from complexbody.body import Body
@@ -78,7 +78,7 @@ class Problem:
         # All layers below rely on one numbering of nodes and P1 degrees of freedom.
         assert np.array_equal(dofs, _compat.cell_nodes(scene.mesh))
         self.supports = boundary.supports(scene, self.action)
-        self.loads = boundary.loads(scene, self.action)
+        self.loads = loading.loads(scene, self.action)
         self.start = boundary.initial(scene, self.action)
         self._read_inertia()
         self.node_step: float | Array = 0.0

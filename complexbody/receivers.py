@@ -26,13 +26,14 @@ class Receivers:
     Args:
         problem: The scene, made ready, whose node records are probed.
         output: Names the probes and the folder.
+        resume: Keep an earlier run's rows up to this time [s]; None keeps none.
 
     Raises:
         SceneError: for points outside the body.
         OutputError: if the tables cannot be written.
     """
 
-    def __init__(self, problem: Problem, output: Output) -> None:
+    def __init__(self, problem: Problem, output: Output, resume: float | None = None) -> None:
         scene, disc, self._problem = problem.whole, problem.disc, problem
         self.probes, self.n, self.n_u = (
             Probes(scene, output.probes), scene.components, scene.displacement,
@@ -47,8 +48,12 @@ class Receivers:
         columns = {"time": "s", **{a: "" if a.startswith("nu") else "m" for a in labels}}
         folder = Path(output.folder)
         self._tables = [
-            CsvWriter(folder / f"probe-{m}.csv", columns, self.comm) for m in self.names
+            CsvWriter(folder / f"probe-{m}.csv", columns, self.comm, resume) for m in self.names
         ]
+        if resume is not None and self.comm.rank == 0:
+            rows = [np.array(t.kept).reshape(-1, 1 + self.n) for t in self._tables]
+            first = [rows[0][:, :1]] if rows else []
+            self._done.append(np.concatenate([*first, *(r[:, 1:] for r in rows)], axis=1))
 
     def record(self, time: float, positions: Array) -> None:
         """Note the values at ``time`` [s] from node records (nodes, at least n)."""
@@ -84,6 +89,12 @@ class Receivers:
             u, nu = values[:, : self.n_u], values[:, self.n_u :]
             out[name] = {"time": data[:, 0], "u": u, "nu": nu}
         return out
+
+    def sync(self) -> None:
+        """Bring what was recorded to the files, and see that it lasts; collective."""
+        self.flush()
+        for table in self._tables:
+            table.sync()
 
     def close(self) -> None:
         """Close the files."""

@@ -16,8 +16,9 @@ import numpy.typing as npt
 import ufl
 
 from complexbody.body import Body
-from complexbody.boundary import Loads, Supports
+from complexbody.boundary import Supports
 from complexbody.live import Live
+from complexbody.loading import Loads
 from complexbody.scene import Initial, Scene
 
 Array = npt.NDArray[np.float64]

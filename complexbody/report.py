@@ -130,7 +130,7 @@ def integrator(name: str, method: Any) -> str:
     return entry("integrator", f"{name} (order {method.order}): {options}")
 
 
-def output(plan: Output, until: float, ledger_steps: int) -> str:
+def output(plan: Output, until: float, ledger_steps: int, resumed: bool = False) -> str:
     """What is written, where and when."""
     count = len(plan.schedule(until))
     parts = [f"ledger every {ledger_steps} step{'s' if ledger_steps > 1 else ''}"]
@@ -139,6 +139,7 @@ def output(plan: Output, until: float, ledger_steps: int) -> str:
     if plan.probes:
         parts.append(f"probes {', '.join(plan.probes)} every {plan.probe_steps} steps")
     again = " (replaces an earlier run)" if (Path(plan.folder) / "run.json").exists() else ""
+    again = "" if resumed else again
     return entry("output", f"{plan.folder}{again}: {'; '.join(parts)}")
 
 
@@ -167,14 +168,25 @@ def before(job: Any, name: str, method: Any, plan: Output, until: float) -> list
         *time_sets(job.run_.time_sets),
         *planned(job.plan),
         memory(s.bytes_per_cell, s.cells),
-        output(plan, until, job.every),
+        output(plan, until, job.every, job.resumed is not None),
     ]
+
+
+def resumed(job: Any) -> list[str]:
+    """Where a run goes on, and how well; nothing if it begins."""
+    if job.resumed is None:
+        return []
+    path, about, same = job.resumed.path, job.resumed.about, job.resumed.same
+    how = "to the bit" if same else f"to round-off: the cells of its {about['ranks']} ranks differ"
+    return [entry("resumed", f"at t = {about['time']:.6g} s, from {path.name}, {how}")]
 
 
 def after(result: Result) -> list[str]:
     """Wall time by part, rate, and whether the books balance."""
     s = result.stats
     parts = {"set-up": s.set_up, "steps": s.stepping, "ledger": s.booking, "writing": s.writing}
+    if s.saving > 0:
+        parts["checkpoints"] = s.saving
     times = ", ".join(f"{name} {seconds(value)}" for name, value in parts.items())
     return [
         entry("time", times),

@@ -28,7 +28,8 @@ class Statistics:
         cells, nodes: Of the whole body; ranks: processes.
         updates: Cell updates done by all ranks; rate: per second of stepping.
         quiet: Share of cell updates that were skipped, since all nodes of these cells were at zero.
-        set_up, stepping, booking, writing: Seconds of the slowest rank.
+        set_up, stepping, booking, writing, saving: Seconds of the slowest rank; the last ones on
+            checkpoints. Of a run that was resumed, of all its parts up to their checkpoints.
         bytes_per_cell: Memory beside dolfinx's own mesh.
     """
 
@@ -45,6 +46,7 @@ class Statistics:
     stepping: float = 0.0
     booking: float = 0.0
     writing: float = 0.0
+    saving: float = 0.0
     bytes_per_cell: float = 0.0
 
 

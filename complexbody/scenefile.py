@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from complexbody import _compat
 from complexbody.errors import CommandError, ComplexBodyError
 from complexbody.scene import Scene
 from complexbody.together import Interrupted
@@ -166,6 +167,7 @@ class SceneFile:
         Raises:
             CommandError: naming file, line and exception, or what it returned instead of a Scene.
         """
+        _compat.steady_partitions()  # a run that is resumed has the same parts
         with self._blamed("scene()"):
             made = self._function(comm, **parameters)  # type: ignore[misc]
         if not isinstance(made, Scene):

@@ -8,6 +8,8 @@ the cubic Hermite interpolant of fields and rates, whose error is of higher orde
 from __future__ import annotations
 
 import time as clock
+from contextlib import nullcontext
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -15,9 +17,11 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody import planning
-from complexbody.boundary import try_histories
+from complexbody import machine, planning
+from complexbody.amplitudes import try_histories
+from complexbody.checkpoint import FOLDER, Checkpoint, Found, described, find
 from complexbody.errors import (
+    AccuracyError,
     ComplexBodyError,
     DivergenceError,
     IntegratorError,
@@ -28,6 +32,7 @@ from complexbody.errors import (
 )
 from complexbody.files import CsvWriter
 from complexbody.given import is_flag, is_positive, is_whole, short
+from complexbody.identity import identity
 from complexbody.instabilities import warn_of
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.entries import Run
@@ -35,7 +40,9 @@ from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
 from complexbody.integrators.peers import AssembledLeapfrog, Newmark, PetscTS
 from complexbody.integrators.synchronous import Synchronous
+from complexbody.keeper import Description, Keeper, clear
 from complexbody.ledger import Bookkeeper
+from complexbody.numbering import Numbering
 from complexbody.output import Output, Writer
 from complexbody.problem import Problem
 from complexbody.progress import Progress
@@ -61,6 +68,8 @@ def simulate(
     plan: bool = True,
     quiet: bool | None = None,
     accuracy: float | None = None,
+    checkpoint: Checkpoint | None = None,
+    resume: bool | str | Path = False,
 ) -> Result:
     """Run a scene from t = 0 to ``until``; collective.
 
@@ -80,6 +89,10 @@ def simulate(
             explicit forces; the others act on all cells).
         accuracy: Relative error to meet at the end, in place of an integrator: the larger one of u
             and ν (L2), over their largest norms (:mod:`complexbody.accuracy`).
+        checkpoint: When to make checkpoints; none by default.
+        resume: Go on from the newest good checkpoint of this scene: True for that of ``checkpoint``
+            and ``output``, or a folder of a run, or a file. The step stays that of its run,
+            whatever ``until`` is; files go on where they were then.
 
     Returns:
         Fields at the final time, ledger, probes and statistics.
@@ -89,12 +102,16 @@ def simulate(
     """
     options: dict[str, Any] = {
         "until": until, "output": output, "ledger_steps": ledger_steps, "growth": growth,
-        "progress": progress, "plan": plan, "quiet": quiet,
+        "progress": progress, "plan": plan, "quiet": quiet, "checkpoint": checkpoint,
     }  # fmt: skip
     if not isinstance(scene, Scene):
         raise SceneError(f"simulate: the scene is {short(scene)}. Give a cb.Scene.")
     if accuracy is None:
-        return Simulation(scene, integrator, **options).run()
+        return Simulation(scene, integrator, **options, resume=resume).run()
+    if resume:
+        raise AccuracyError(
+            "simulate: accuracy= chooses the integrator, and resume= has one. Give one of them."
+        )
     from complexbody.accuracy import Accurate  # it stands above: it makes simulations
 
     return Accurate(scene, accuracy, integrator, **options).run()
@@ -158,6 +175,7 @@ class Simulation:
         problem, run_: The scene made ready, and the integrator's run.
         every: Steps between two ledger rows.
         stats: Filled in as far as known before the run.
+        resumed: The checkpoint that it goes on from, or None.
     """
 
     stats: Statistics
@@ -175,6 +193,8 @@ class Simulation:
         plan: bool = True,
         quiet: bool | None = None,
         watch: Watch | None = None,
+        checkpoint: Checkpoint | None = None,
+        resume: bool | str | Path = False,
     ) -> None:
         begun = clock.perf_counter()
         check_options(
@@ -191,11 +211,11 @@ class Simulation:
         self.scene, self.until, self.output, self.comm = scene, until, output, scene.mesh.comm
         self.problem = Problem(scene, reduce=plan)
         try:
-            self._make_ready(plan, quiet, ledger_steps, growth, progress)
+            self._make_ready(plan, quiet, ledger_steps, growth, progress, checkpoint, resume)
         except ComplexBodyError:  # which all ranks have: closing is collective
             self.problem.close()
             raise
-        self.stats.set_up = clock.perf_counter() - begun
+        self.stats.set_up += clock.perf_counter() - begun
 
     def _make_ready(
         self,
@@ -204,6 +224,8 @@ class Simulation:
         ledger_steps: int | None,
         growth: float | None,
         progress: bool | None,
+        checkpoint: Checkpoint | None,
+        resume: bool | str | Path,
     ) -> None:
         """All but the problem itself."""
         until, output = self.until, self.output
@@ -211,13 +233,38 @@ class Simulation:
             try_histories(self.comm, data.histories, until)
         warn_of(self.problem, self.method, until)
         self.problem.quiet = plan if quiet is None else quiet
-        self.run_: Run = self.method.prepare(self.problem, until)
+        folder = checkpoint.place(output) if checkpoint is not None else None
+        known: dict[str, list[Any]] = {}
+        found: Found | None = None
+        if folder is not None or resume:
+            known = identity(self.problem, Numbering(self.problem.disc))
+        if resume:
+            place = (checkpoint or Checkpoint()).place(output) if resume is True else resume
+            found = find(place, self.problem, self.method, known)
+        self.resumed = found
+        # A run keeps the step that it began with.
+        self.begun_for = until if found is None else float(found.about["until"])
+        self.run_: Run = self.method.prepare(self.problem, self.begun_for)
         self.problem.release()
+        if found is not None:
+            found.require(self.run_.step, until)
+            self.run_.restore(found.snapshot(Numbering(self.problem.disc)))
         self.plan = planning.of_run(self.problem, self.method) if plan else None
         self.last = _steps(until, self.run_.step)
         self.times = output.schedule(until) if output is not None else np.zeros(0)
+        self.keeper: Keeper | None = None
+        if checkpoint is not None and folder is not None:
+            self.keeper = Keeper(
+                self.problem, self.run_, checkpoint, folder, self._about(known), self._describe,
+                self._settle, fresh=found is None,
+            )  # fmt: skip
+        elif output is not None and found is None:
+            clear(self.comm, Path(output.folder) / FOLDER)  # they belong to what is replaced
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
-        self.writer = Writer(self.problem.whole_action, output) if output is not None else None
+        written = None if found is None else float(found.about["written"])
+        self.writer = (
+            Writer(self.problem.whole_action, output, written) if output is not None else None
+        )
         if self.writer is not None:
             self.writer.write_steps(self._steps())
         self.books = Bookkeeper(self.problem, self.run_, growth)
@@ -226,17 +273,64 @@ class Simulation:
         self.receivers: Receivers | None = None
         self.csv: CsvWriter | None = None
         if output is not None:
+            reached = None if found is None else float(found.about["time"])
             if output.probes:
-                self.receivers = Receivers(self.problem, output)
+                self.receivers = Receivers(self.problem, output, reached)
             ledger = self.books.ledger
             columns = dict(zip(ledger.columns, ledger.units(), strict=True))
-            self.csv = CsvWriter(Path(output.folder) / "ledger.csv", columns, self.comm)
-        self._written = -1.0
+            path = Path(output.folder) / "ledger.csv"
+            self.csv = CsvWriter(path, columns, self.comm, reached)
+        self._written, self._noted, self._before = -1.0, -1, (np.zeros(0), np.zeros(0))
         self.progress = Progress(self.comm, until, progress)
         self._statistics()
         self.every = ledger_steps or default_ledger_steps(
             self.stats.cells, self.comm.size, self.last
         )
+        if found is not None:
+            self._resume(found)
+
+    # --- checkpoints ---------------------------------------------------------------------------
+
+    def _about(self, known: dict[str, list[Any]]) -> dict[str, Any]:
+        """What stays the same in all checkpoints of the run."""
+        output = None
+        if self.output is not None:
+            output = {f.name: getattr(self.output, f.name) for f in fields(self.output)}
+            output = {k: v for k, v in output.items() if k != "folder"}
+        return {
+            "identity": known, "integrator": described(self.method), "until": self.begun_for,
+            "end": self.until, "output": output, "versions": machine.versions(),
+        }  # fmt: skip
+
+    def _describe(self) -> Description:
+        """What a checkpoint keeps of the simulation around the run."""
+        rows = len(self.books.ledger)
+        about = {
+            "books": self.books.state(), "written": self._written, "every": self.every,
+            "noted": self._noted == self.run_.steps, "statistics": asdict(self.stats),
+        }  # fmt: skip
+        return about, {"ledger": lambda: np.array(self.books.ledger.rows[:rows])}
+
+    def _settle(self) -> None:
+        """See that all that is written so far is in the files, and stays there; collective."""
+        if self.writer is not None:
+            self.writer.sync()
+        if self.receivers is not None:
+            self.receivers.sync()
+        if self.csv is not None:
+            self.csv.sync()
+
+    def _resume(self, found: Found) -> None:
+        """Go on from a checkpoint; collective."""
+        about = found.about
+        rows = None if found.arrays is None else found.arrays["ledger"]
+        rows = np.asarray(self.comm.bcast(rows)).reshape(-1, len(self.books.ledger.columns))
+        self.books.restore(about["books"], rows)
+        self.every = int(about["every"])
+        self._written = float(about["written"])
+        self._noted = self.run_.steps if about["noted"] else -1
+        for name in ("set_up", "stepping", "booking", "writing", "saving"):
+            setattr(self.stats, name, float(about["statistics"][name]))
 
     def _steps(self) -> dict[str, Array]:
         """Step and level of each of this rank's cells."""
@@ -262,15 +356,24 @@ class Simulation:
                 and is ``result`` of the error.
             OutputError: if results cannot be written any more.
         """
+        listening = nullcontext() if self.keeper is None else self.keeper.listening()
         try:
-            self._loop()
-            return self._result()
+            with listening:
+                self._loop()
+                result = self._result()
+                if self.keeper is not None and not self._overshoots:
+                    self.keeper.save()
+                return self._counted(result)
         except (DivergenceError, SolverError) as error:
             # A history that failed on some rank since the last row gave it NaN.
             for data in (self.problem.loads, self.problem.supports):
                 agree(self.comm, data.failure)
             if isinstance(error, SolverError):
+                if self.keeper is not None:
+                    self.keeper.save()
                 error.result = self._keep()
+            elif self.keeper is not None:
+                self.keeper.fall_back()
             raise
         finally:
             self._close()
@@ -280,11 +383,14 @@ class Simulation:
     def _loop(self) -> None:
         run = self.run_
         tiny = 1e-9 * run.step
-        pending = [t for t in self.times if t < self.until - tiny]
-        self._note()
+        pending = [t for t in self.times if self._written < t < self.until - tiny]
+        if self._noted != run.steps:
+            self._note()
         while pending and pending[0] <= tiny:
             self._write(pending.pop(0), *run.sample())
         while run.steps < self.last:
+            if self.keeper is not None:
+                self.keeper.look()
             stop = min(self.last, (run.steps // self.every + 1) * self.every)
             if self.receivers is not None:
                 stride = self.receivers.stride
@@ -294,10 +400,16 @@ class Simulation:
                 stop = min(stop, (run.steps // stride + 1) * stride)
             if pending:
                 stop = min(stop, int(np.floor(pending[0] / run.step + 1e-9)))
+            if self.keeper is not None:
+                stop = min(stop, self.keeper.pause(run.steps))
+            if self._overshoots:
+                stop = self._ending(stop)
             if stop > run.steps:
                 self._advance(stop - run.steps)
                 self._note()
             if pending and pending[0] < (run.steps + 1) * run.step - tiny:
+                if self.keeper is not None:
+                    self.keeper.look()
                 pending = self._between(pending, tiny)
         self.progress.update(self.until, run.steps)
 
@@ -308,8 +420,14 @@ class Simulation:
         updates = self.stats.cells if sets is None else sets.updates
         piece = max(1, 50_000_000 // max(updates // self.comm.size, 1))
         while steps > 0:
+            if self.keeper is not None:
+                piece = min(piece, self.keeper.stride)
             self.run_.advance(min(piece, steps))
             steps -= piece
+            if self.keeper is not None and steps > 0:
+                self.stats.stepping += clock.perf_counter() - begun
+                self.keeper.look()
+                begun = clock.perf_counter()
         self.stats.stepping += clock.perf_counter() - begun
         self.progress.update(self.run_.time, self.run_.steps)
 
@@ -320,6 +438,7 @@ class Simulation:
             self.receivers.record(run.time, run.positions())
         if run.steps % self.every == 0 and run.steps < self.last:
             self._book()
+        self._noted = run.steps
         if self.watch is not None and (run.steps % self._looks() == 0 or run.steps == self.last):
             self.watch.look(run, self.problem)
 
@@ -332,7 +451,8 @@ class Simulation:
         """Write all times due before the next step's end, by Hermite interpolation."""
         run = self.run_
         x, rates = run.sample()
-        x0, v0, t0 = x.copy(), rates.copy(), run.time
+        self._before = x0, v0 = x.copy(), rates.copy()
+        t0 = run.time
         while pending and pending[0] <= t0 + tiny:
             self._write(pending.pop(0), x0, v0)
         if not pending or pending[0] >= t0 + run.step - tiny:
@@ -345,17 +465,29 @@ class Simulation:
         self._note()
         return pending
 
+    @property
+    def _overshoots(self) -> bool:
+        """Whether a given step does not divide the time to ``until``."""
+        return abs(self.last * self.run_.step - self.until) > 1e-9 * self.run_.step
+
+    def _ending(self, stop: int) -> int:
+        """Where to stop next: before the last step, whose ends make what is at ``until``."""
+        if self.run_.steps < self.last - 1:
+            return min(stop, self.last - 1)
+        x, rates = self.run_.sample()
+        self._before = x.copy(), rates.copy()
+        if self.keeper is not None:
+            self.keeper.save()
+        return stop
+
     def _final(self) -> tuple[Array, Array]:
         """Fields and rates at ``until``; interpolated if a given step does not divide it."""
         run = self.run_
         x1, v1 = run.sample()
-        if abs(run.time - self.until) <= 1e-9 * run.step:
+        if not self._overshoots:
             return x1, v1
-        # One step too far: the last interval is interpolated by its end and the drift before it.
-        h, kernels = run.step, self.problem.kernels
-        x0 = x1 - h * kernels.v
-        v0 = 2 * kernels.v - v1
-        return hermite((self.until - run.time + h) / h, h, x0, v0, x1, v1)
+        part = (self.until - run.time + run.step) / run.step
+        return hermite(part, run.step, *self._before, x1, v1)
 
     def _keep(self) -> Result:
         """The state before the step that failed, written and returned."""
@@ -363,7 +495,9 @@ class Simulation:
         return self._made(self.run_.time, self.run_.positions(), self.problem.kernels.v)
 
     def _result(self) -> Result:
-        self._book()
+        rows = self.books.ledger.rows
+        if not rows or rows[-1][0] != self.run_.time:  # there already if it was killed at the end
+            self._book()
         return self._made(self.until, *self._final())
 
     def _made(self, t: float, x: Array, rates: Array) -> Result:
@@ -385,6 +519,13 @@ class Simulation:
             *fields, t, self.books.ledger, s, self.scene, probes, folder, self.method,
             self.run_.time_sets, getattr(self.run_, "summary", str)(), self.plan,
         )  # fmt: skip
+
+    def _counted(self, result: Result) -> Result:
+        """The result, with the time that checkpoints took."""
+        if self.keeper is not None:
+            mine = self.stats.saving + self.keeper.seconds
+            self.stats.saving = self.comm.allreduce(mine, op=MPI.MAX)
+        return result
 
     # --- what leaves the run -------------------------------------------------------------------
 
@@ -415,6 +556,8 @@ class Simulation:
                 self.csv.write(new)
             if self.receivers is not None:
                 self.receivers.flush()
+        if self.keeper is not None:
+            self.keeper.note()
         self.stats.booking += clock.perf_counter() - begun
 
     def _close(self) -> None:

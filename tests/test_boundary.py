@@ -9,7 +9,7 @@ from harness import everywhere, refused, wavy
 from mpi4py import MPI
 
 import complexbody as cb
-from complexbody import _compat, boundary
+from complexbody import _compat, boundary, loading
 from complexbody.action import Action
 from complexbody.errors import SceneError
 
@@ -67,7 +67,7 @@ def supports(mesh, *fixes, tags=None):
 
 def loads(mesh, *given, tags=None, cells=None, body=BODY):
     scene = cb.Scene(mesh, body, loads=given, facet_tags=tags, cell_tags=cells)
-    return boundary.loads(scene, Action(scene))
+    return loading.loads(scene, Action(scene))
 
 
 def total(mesh, found, components=5, times=(0.0,)):

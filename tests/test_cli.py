@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import complexbody as cb
-from complexbody import commands, errors, machine, native, report, together
+from complexbody import commands, errors, machine, native, report, statefile, together
 from complexbody.cli import main, parser
 from complexbody.scenefile import SceneFile
 
@@ -521,6 +521,46 @@ def scene(comm): return plain(comm, load=stopping)
         np.testing.assert_allclose(times[:3], [0.0, 0.1, 0.2])
         assert 'Value="0.2"' in (out / "u.xdmf").read_text()
         assert len(_table(out / "ledger.csv")[1]) >= 1
+
+
+# --- resume ------------------------------------------------------------------------------------
+
+
+def test_resume_goes_on_where_the_run_was(bar, call, comm, shared_path):
+    """Options come from run.json; without checkpoints, or of another scene, the exit code is 6."""
+    path, whole, out = bar(CHECK), shared_path / "whole", shared_path / "out"
+    words = ("--set", "cells=16", "--step", "0.01", "--every", "0.1")
+    assert call("run", path, *words, "--out", whole)[0] == 0
+    assert call("run", path, *words, "--out", out, "--checkpoint-steps", "20")[0] == 0
+    if comm.rank == 0:
+        newest, *_ = statefile.listed(out / "checkpoints")
+        newest.unlink()
+    comm.barrier()
+    code, text, err = call("resume", out)
+    assert (code, err) == (0, "")
+    assert "resumed     at t = 0.4 s, from step-000000000040.npz, to the bit" in text
+    assert "check " in text and "replaces" not in text
+    assert record(out)["statistics"]["steps"] == 50
+    if comm.rank == 0:
+        for name in ("ledger.csv", "probe-mid.csv"):
+            assert (out / name).read_bytes() == (whole / name).read_bytes()
+    comm.barrier()
+    code, text, err = call("resume", out, "--until", "0.7")
+    assert (code, err) == (0, "")
+    assert record(out)["ledger"]["time"] == pytest.approx(0.7)
+    code, _, err = call("resume", out, "--until", "0.3")
+    assert code == 6 and "is at t = 0.7 s already" in err
+    code, _, err = call("resume", shared_path / "nowhere")
+    assert code == 6 and "has no run to resume" in err
+    assert call("run", path, *words, "--out", out, "--checkpoint-every", "0")[0] == 0
+    code, _, err = call("resume", out)  # those of the run before are not its own
+    assert code == 6 and "No checkpoint in" in err
+    code, _, err = call("resume", shared_path / "whole")  # has one, of its end
+    assert code == 0, err
+    bar("Y = 1\n" + CHECK.replace("def check", "plain = scene\ndef scene(comm, cells=20):\n"
+        "    return plain(comm, cells + 1)\n\ndef check"))  # fmt: skip
+    code, _, err = call("resume", whole)
+    assert code == 6 and "of another run: it has another mesh" in err
 
 
 # --- check -------------------------------------------------------------------------------------

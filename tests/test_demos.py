@@ -30,6 +30,16 @@ SMALL = [
         ("--set", "dim=3", "--set", "refine=0.2", "--set", "grading=75", "--until", "0.5"),
         "local leapfrog",
     ),
+    ("decagonal_waves.py", ("--set", "cells=80"), "of dispersion"),
+    ("cosserat_beam.py", ("--set", "layers=6", "--until", "1e-4"), "of the formula"),
+    (
+        "band_gap.py",
+        ("--set", "cells=1800", "--set", "length=58", "--until", "80"),
+        "in the gap q within",
+    ),
+    ("microcracked_plate.py", ("--set", "cells=80"), "of dispersion"),
+    ("nematic.py", ("--set", "cells=16"), "tilt grows at"),
+    ("your_own_body.py", ("--set", "cells=600", "--until", "10"), "kinks have run"),
 ]
 
 
@@ -46,4 +56,4 @@ def test_demo(demo, options, told, comm, shared_path):
 
 
 def test_every_demo_is_here():
-    assert {path.name for path in DEMOS.glob("*.py")} == {name for name, *_ in SMALL}
+    assert {path.name for path in DEMOS.glob("[!_]*.py")} == {name for name, *_ in SMALL}

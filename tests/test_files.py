@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 from written import body, domain, fields, read, wavy
 
+from complexbody import series
 from complexbody.action import Action
 from complexbody.errors import OutputError
 from complexbody.files import CsvWriter
@@ -87,18 +89,73 @@ def test_unwritable_folders(comm, shared_path):
         writer.write(0.0, fields(scene, wavy))
 
 
-def test_a_full_disk(comm, shared_path, monkeypatch):
-    """All ranks say so, before HDF5 breaks; what is there stays readable."""
+def test_a_full_disk(comm, shared_path):
+    """All ranks say so; what is there stays readable, and goes on when there is room again.
+
+    A limit to the size of files stands for it: the system refuses in the same place.
+    """
     scene = Scene(domain(comm, 2), body())
     writer = Writer(Action(scene), Output(shared_path, fields="u"))
+    table = CsvWriter(shared_path / "t.csv", {"time": "s"}, comm)
     writer.write(0.0, fields(scene, wavy))
-    nearly = shutil.disk_usage(shared_path)._replace(free=1000)
-    with monkeypatch.context() as patch, pytest.raises(OutputError, match="No space left"):
-        patch.setattr(shutil, "disk_usage", lambda path: nearly)
-        writer.write(1.0, fields(scene, wavy))
+    table.write([[0.0]])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, limits[1]))
+        with pytest.raises(OutputError, match="File too large"):
+            writer.write(1.0, fields(scene, wavy))
+        with pytest.raises(OutputError, match="File too large"):
+            table.write([[float(i)] for i in range(1000)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    comm.barrier()
+    assert [step[0] for step in read(shared_path / "u.xdmf")[2]] == [0.0]
+    assert (shared_path / "t.csv").read_text() == "time [s]\n0.0\n"
+    comm.barrier()
     writer.write(2.0, fields(scene, wavy))
+    table.write([[2.0]])
     comm.barrier()
     assert [step[0] for step in read(shared_path / "u.xdmf")[2]] == [0.0, 2.0]
+    assert (shared_path / "t.csv").read_text() == "time [s]\n0.0\n2.0\n"
+    assert not list(shared_path.glob("*.part"))
+    table.close()
+
+
+def test_many_steps_are_in_several_files(comm, shared_path, monkeypatch):
+    """A file is closed for good when it is full or has been synchronised; the index knows all."""
+    monkeypatch.setattr(series, "STEPS", 3)
+    scene, output = Scene(domain(comm, 2), body()), Output(shared_path, fields="u")
+
+    def write(writer, times):
+        for time in times:
+            writer.write(time, fields(scene, lambda x, i, t=time: t + 0 * x[0]))
+
+    def seen():
+        comm.barrier()
+        found = [(step[0], step[2][0, 0]) for step in read(shared_path / "u.xdmf")[2]]
+        comm.barrier()
+        return [time for time, value in found if time == value]
+
+    writer = Writer(Action(scene), output)
+    write(writer, range(4))
+    writer.sync()
+    write(writer, range(4, 9))
+    assert seen() == [*range(9)]
+    names = sorted(path.name for path in shared_path.glob("u*.h5"))
+    assert names == ["u-000003.h5", "u-000004.h5", "u-000007.h5", "u.h5"]
+    writer = Writer(Action(scene), output, resume=5.5)
+    assert seen() == [*range(6)]
+    assert sorted(path.name for path in shared_path.glob("u*.h5")) == [names[0], names[1], "u.h5"]
+    write(writer, range(3, 8))
+    assert seen() == [*range(8)]
+    if comm.rank == 0:
+        (shared_path / "u.xdmf").unlink()
+    comm.barrier()
+    Writer(Action(scene), output, resume=100.0)
+    assert seen() == [*range(8)]
+    Writer(Action(scene), output)
+    comm.barrier()
+    assert [path.name for path in shared_path.glob("u*.h5")] == ["u.h5"]
 
 
 def test_tables(comm, shared_path):

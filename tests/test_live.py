@@ -10,7 +10,7 @@ from harness import everywhere, largest
 from mpi4py import MPI
 
 import complexbody as cb
-from complexbody import boundary, meshes
+from complexbody import boundary, loading, meshes
 from complexbody.action import Action
 from complexbody.errors import CoercivityError
 from complexbody.live import live
@@ -55,7 +55,7 @@ def plane(comm, which=None, cells=(9, 8), **more):
 def reached(scene):
     """Live components, without making anything ready to run."""
     action = Action(scene)
-    data = boundary.supports(scene, action), boundary.loads(scene, action)
+    data = boundary.supports(scene, action), loading.loads(scene, action)
     return list(live(scene, *data, boundary.initial(scene, action)).components)
 
 

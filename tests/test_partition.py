@@ -10,9 +10,9 @@ from mpi4py import MPI
 import complexbody as cb
 from complexbody import _compat, meshes
 from complexbody.errors import MeshError
-from complexbody.files import in_input_order
 from complexbody.forms import isotropic_two_field
 from complexbody.partition import parts
+from complexbody.series import in_input_order
 
 
 def graded(comm, dim=2, cells=24):

@@ -36,7 +36,7 @@ def test_point_pulse(comm, dim, order):
 def test_sources(comm, source):
     """Whatever sets cells moving: loads, at work or not yet, initial data, supports."""
     scene = bar(comm, 1, source, inertia=growing)
-    assert pair(comm, scene, cb.Implicit(), 8, growth=None) > 0.4
+    assert pair(comm, scene, cb.Implicit(), 8) > 0.4
 
 
 def test_until_all_is_awake(comm):
@@ -54,7 +54,7 @@ def test_rest_does_not_last(comm):
     """A kinetic co-energy that pushes, or has a momentum, at rest: nothing is skipped."""
     for chi in (pushed, turned):
         scene = bar(comm, 1, "nothing", inertia=chi)
-        assert pair(comm, scene, cb.Implicit(), 3, growth=None) == 0.0
+        assert pair(comm, scene, cb.Implicit(), 3) == 0.0
 
 
 @pytest.mark.slow

@@ -60,6 +60,16 @@ class Counted:
         self.skipped += saved
         self.updates += due - saved
 
+    def _counts(self) -> Ints:
+        """What a snapshot keeps of the counters."""
+        return np.array([self.updates, self.skipped])
+
+    def _recount(self, counts: npt.NDArray[Any]) -> None:
+        """Go on from these counters."""
+        self.updates, self.skipped = (int(c) for c in counts)
+        if self.activity is not None:
+            self.activity.state.skipped = self.skipped
+
 
 class Activity:
     """Chunks of cells and ranges of nodes, and what is awake of them.

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from complexbody.integrators.entries import Entries, energies, half_quadratic
 from complexbody.integrators.peer_run import PeerRun
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.synchronous_run import refuse_partial
 from complexbody.problem import Problem
 
@@ -143,6 +144,15 @@ class AssembledRun(PeerRun):
                 impulse += 0.5 * h * self._moved(self._damping_rows, both)
             impulse += weight * h * system.r[self._flat]
             self.support_work += 0.5 * float(impulse @ both[self._flat])
+
+    def _add(self, saved: Snapshot) -> None:
+        saved.sums["support"] = np.array([self.support_work])
+        saved.numbers["ready"] = self.ready
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.support_work, self.ready = float(saved.sums["support"][0]), False
+        if saved.numbers["ready"]:
+            self.forces()
 
     # --- what a user sees at t_n -----------------------------------------------------------------
 

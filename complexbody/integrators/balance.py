@@ -28,6 +28,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from complexbody import native
+from complexbody.integrators.snapshot import Snapshot, to_blocks, to_cells
 from complexbody.integrators.windows import WindowPlan
 from complexbody.masses import pencil_basis
 from complexbody.problem import Problem
@@ -143,6 +144,20 @@ class Balance:
                 if disc.group[group.first] < 0:
                     k = np.maximum(self.blend[i, : disc.n], BESIDE_DAMPERS)
                     self.blend[i, : disc.n] = k
+
+    def save(self, saved: Snapshot) -> None:
+        """Add the forces held to a snapshot of the run."""
+        disc = self.run.problem.disc
+        held = to_cells(disc, self.held.transpose(0, 2, 1))
+        saved.corners["held"] = held.reshape(disc.count, disc.dim + 1, disc.n)
+        saved.nodes["load"] = self._load[:-1]
+
+    def restore(self, saved: Snapshot) -> None:
+        """Take them from one."""
+        disc = self.run.problem.disc
+        rows = saved.corners["held"].reshape(disc.count, -1)
+        self.held[:] = to_blocks(disc, rows).transpose(0, 2, 1)
+        self._load[:-1] = saved.nodes["load"]
 
     def begin(self, t: float) -> None:
         """Forces half a step behind t, from positions and rates there: those of the first steps."""

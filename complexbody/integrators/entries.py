@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass
 class Entries:
-    """This rank's share of the books at one time, all in J but for the last three.
+    """This rank's share of the books at one time, all in J but for variations and momentum.
 
     Attributes:
         kinetic_u, kinetic_nu, stored, potential: Energies.
@@ -37,6 +37,7 @@ class Entries:
         size: Size of the terms of E_h.
         variation_u, variation_nu: pV of the rates, ∫Σ|q̇⁺ − q̇⁻|₁ dx.
         momentum: Linear momentum by component [N s].
+        still: Kinetic energy that ν would have without rates, −∫χ(ν, 0); 0 for a quadratic χ.
     """
 
     kinetic_u: float
@@ -53,6 +54,7 @@ class Entries:
     variation_u: float
     variation_nu: float
     momentum: Array
+    still: float = 0.0
 
     def array(self) -> Array:
         """All of it as one array, to be summed over ranks."""

@@ -20,6 +20,7 @@ from complexbody.integrators.activity import ENOUGH, active
 from complexbody.integrators.exact_schedule import ExactSchedule
 from complexbody.integrators.reached import Reached
 from complexbody.integrators.records import RecordRun, World
+from complexbody.integrators.snapshot import Snapshot, to_blocks, to_cells
 from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.problem import Problem
 
@@ -58,14 +59,18 @@ class ExactRun(RecordRun):
         self._touched = self._touched_nodes()
         self._sampled = False
         self.reached: Reached | None = None
+        self._passed = 0  # events left out that ``reached`` does not know of
         self._watch()
 
     def _watch(self) -> None:
-        """Schedule only what motion can reach, if that is not nearly all; collective."""
+        """Schedule only what motion can reach, if that is not nearly all; between spans."""
         problem, disc = self.problem, self.problem.disc
+        self.reached = None
         if not problem.quiet:
             return
-        moving = ((problem.initial_fields != 0) | (problem.initial_rates != 0)).any(axis=1)
+        moving = (problem.initial_rates != 0).any(axis=1) & (self.steps == 0)
+        for first in (0, disc.record):  # positions, rates
+            moving |= (self.record[:-1, first : first + disc.n] != 0).any(axis=1)
         moving[self._touched] = True
         force, _ = problem.kernels.restless()
         restless = np.repeat(force, np.diff(disc.chunks[:, :2], axis=1).ravel())
@@ -73,12 +78,31 @@ class ExactRun(RecordRun):
         moving[node[node < disc.nodes]] = True
         enough = active(disc.cells, moving) > ENOUGH
         if not problem.comm.allreduce(enough, op=MPI.LAND):
-            self.reached = Reached(problem, self.c, self.schedule, moving)
+            self.reached = Reached(problem, self.c, self.schedule, moving, self.time)
 
     def wake(self) -> None:
         """All cells act from now on."""
         if self.reached is not None:
             self.reached.stop()
+
+    def snapshot(self) -> Snapshot:
+        """The run between two spans, with its cells' counters."""
+        saved = super().snapshot()
+        counters = self.schedule.counters()
+        if self.reached is not None and self.reached.on:
+            counters = self.reached.counters(counters, self.steps_of, self.time)
+        saved.cells["counter"] = to_cells(self.problem.disc, counters)
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.schedule.set(to_blocks(self.problem.disc, saved.cells["counter"]))
+        self._sampled = False
+        self._watch()
+
+    def _recount(self, counts: npt.NDArray[np.int64]) -> None:
+        super()._recount(counts)
+        if self.reached is not None:
+            self._passed = self.skipped - self.reached.skipped(self.time)
 
     def _touched_nodes(self) -> npt.NDArray[np.int32]:
         """Nodes that loads or moving supports act on, on any rank."""
@@ -113,7 +137,7 @@ class ExactRun(RecordRun):
             self._sampled = False
             self._book_supports(end)
         if self.reached is not None:
-            self.skipped = self.reached.skipped(self.time)
+            self.skipped = self._passed + self.reached.skipped(self.time)
 
     def _see(self) -> None:
         """Bring the copy of the records to the last span's end, unless it is there."""
@@ -150,5 +174,6 @@ class ExactRun(RecordRun):
         self._see()
         if not self.losing:
             return 0.0
-        record = self.problem.disc.record
-        return float(np.sum(self._copy[:-1, 2 * record : 2 * record + self.problem.disc.n]))
+        disc, first = self.problem.disc, 2 * self.problem.disc.record
+        # A snapshot gives all copies of a node what its owner knows.
+        return float(np.sum(self._copy[:-1, first : first + disc.n][disc.owned]))

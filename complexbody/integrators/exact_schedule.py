@@ -98,6 +98,7 @@ class ExactSchedule:
     def __init__(self, problem: Problem, steps: Array, span: float, trapezoidal: bool) -> None:
         disc = problem.disc
         self.halo, self.comm, self.n = disc.halo, problem.comm, disc.n
+        self._blocks = disc.source_cell.shape
         cells = disc.blocks * disc.lanes
         original = _compat.original_cells(problem.scene.mesh)
         source = disc.source_cell.ravel()
@@ -249,6 +250,25 @@ class ExactSchedule:
         """Let all cells act at t = 0 again."""
         self.counter[:] = 0
         self.arrays["due"][:] = np.where(np.isfinite(self.arrays["step"]), 0.0, np.inf)
+
+    def counters(self) -> Ints:
+        """j of the next event of this rank's cells, in blocks (blocks, W)."""
+        cells = self.counter[self._index[: self.state.cells]]
+        return cells.reshape(self._blocks)
+
+    def set(self, counters: Ints) -> None:
+        """Let cells go on with these events (blocks, W), on all ranks; collective."""
+        cells, own = self.state.cells, counters.ravel()
+        self.counter[self._index[:cells]] = own
+        told: list[Ints] = [np.zeros(0, np.int64) for _ in range(self.comm.size)]
+        for rank, (cell, _) in zip(self.halo.neighbours, self._touches, strict=True):
+            told[rank] = own[cell]
+        heard = self.comm.alltoall(told) if self.comm.size > 1 else []
+        visits = [heard[rank] for rank in self.halo.neighbours]
+        self.counter[self._index[cells:]] = np.concatenate([*visits, np.zeros(0, np.int64)])
+        step = self.arrays["step"]
+        with np.errstate(invalid="ignore"):
+            self.arrays["due"][:] = np.where(np.isfinite(step), self.counter * step, np.inf)
 
     # --- a span ------------------------------------------------------------------------------
 

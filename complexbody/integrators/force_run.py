@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from complexbody import native
 from complexbody.integrators.activity import ENOUGH, Activity, Counted, active
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.timetable import TimeSets
 from complexbody.kernels.library import State
 from complexbody.problem import Problem
@@ -34,6 +35,8 @@ class ForceRun(Counted):
     def __init__(self, problem: Problem, step: float, critical: float) -> None:
         self.problem, self.step, self.critical = problem, step, critical
         self.steps, self.ready = 0, False
+        self._watching = False
+        self._restless: npt.NDArray[np.bool_] | None = None
         # Whose masses a node has: sums of energies read it too.
         problem.kernels.state.klass = problem.masses.classes.ctypes.data
         self._state_of_its_own()
@@ -44,15 +47,18 @@ class ForceRun(Counted):
         self.state = ctypes.byref(self._own)
 
     def watch(self, moving: npt.NDArray[np.bool_] | None = None) -> None:
-        """Skip what is quiet from now on, if enough is; before the first step, f being reset.
+        """Skip what is quiet from now on, if enough is; between steps, f being reset.
 
         Args:
             moving: More nodes that are never quiet (nodes,).
         """
         problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
+        self._watching, self._restless = True, moving
+        self.activity = self.watched = self._own.activity = None
         if not (problem.quiet and disc.blocks):
             return
-        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
+        rates = kernels.v[:-1, : disc.n] if self.steps else problem.initial_rates
+        stirred = (kernels.x[:-1, : disc.n] != 0) | (rates != 0)
         stirred = (stirred | (kernels.f[:-1, : disc.n] != 0)).any(axis=1)
         stirred[problem.load_position // disc.record] = True
         if moving is not None:
@@ -116,6 +122,34 @@ class ForceRun(Counted):
     def positions(self) -> Array:
         """(u, ν) at t_n, node records."""
         return self.problem.kernels.x
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two steps; arrays are views, valid until a step; collective."""
+        kernels, n = self.problem.kernels, self.problem.disc.n
+        return Snapshot(
+            {"steps": self.steps, "ready": self.ready},
+            nodes={"x": kernels.x[:-1, :n], "v": kernels.v[:-1, :n]},
+            sums={"sums": kernels.sums, "counts": self._counts()},
+        )
+
+    def restore(self, saved: Snapshot) -> None:
+        """Go on from a snapshot of a run of the same scene, step and options; collective."""
+        kernels, n = self.problem.kernels, self.problem.disc.n
+        kernels.x[:-1, :n], kernels.v[:-1, :n] = saved.nodes["x"], saved.nodes["v"]
+        kernels.sums[:] = saved.sums["sums"]
+        self.steps, self.ready = int(saved.numbers["steps"]), False
+        kernels.reset_forces()
+        self._refresh(saved)
+        if saved.numbers["ready"]:
+            self.forces()
+        self._recount(saved.sums["counts"])
+
+    def _refresh(self, saved: Snapshot) -> None:
+        """Take what else a kind of run has in a snapshot, before forces."""
+        if self._watching:
+            self.watch(self._restless)
 
     def close(self) -> None:
         """Do nothing: messages are the problem's."""

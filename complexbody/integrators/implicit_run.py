@@ -18,6 +18,7 @@ from complexbody.integrators.entries import Entries, energies
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.global_newton import GlobalNewton
 from complexbody.integrators.nodal_newton import NodalNewton
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.problem import Problem
 
 if TYPE_CHECKING:
@@ -128,13 +129,14 @@ class ImplicitRun(ForceRun):
                 before = 0.0 if half else 0.5
                 kernels.sums[4] += self._support_work(kernels.v, before)
                 kernels.sums[4] += self._support_work(self.next, 1.0 - before)
+            # So do loads: half of the mean rate, whose work is exact for a constant inertia.
+            kick = 0.25 * h if half else 0.5 * h
+            amplitude = self.amplitude(self.time)
+            kernels.sums[3] += kick * problem.load_power(amplitude, kernels.v)
             self.solver.commit()
             if self.activity is not None:
                 kernels.c.cb_look(self.state)
-            if len(problem.load_value):
-                for t in (self.time, self.time + h):
-                    power = problem.load_power(self.amplitude(t), kernels.v)
-                    kernels.sums[3] += 0.5 * h * power
+            kernels.sums[3] += kick * problem.load_power(amplitude, kernels.v)
             kernels.reset_forces()
             self.steps += 1
             self.ready = False
@@ -180,6 +182,29 @@ class ImplicitRun(ForceRun):
             "state is kept."
         )
 
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two steps; arrays are views, valid until a step; collective."""
+        saved, n = super().snapshot(), self.problem.disc.n
+        saved.nodes |= {"previous": self.previous[:-1, :n], "momentum": self.momentum}
+        saved.sums["newton"] = self.count[:1]
+        saved.numbers |= {"most": max(self.problem.comm.allgather(int(self.count[1])))}
+        saved.numbers |= {"solved": int(self.count[2]), "linear": self.linear, **vars(self.range)}
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.previous[:-1, : self.problem.disc.n] = saved.nodes["previous"]
+        self.momentum[:] = saved.nodes["momentum"]
+        newton, numbers = saved.sums["newton"][0], saved.numbers
+        self.count[:] = newton, numbers["most"], numbers["solved"]
+        self.linear = int(numbers["linear"])
+        for name in vars(self.range):
+            setattr(self.range, name, numbers[name])
+        super()._refresh(saved)
+        if isinstance(self.solver, NodalNewton) and self.steps > 0:
+            self.solver.follow()
+
     # --- what a user sees at t_n ---------------------------------------------------------------
 
     def sample(self) -> tuple[Array, Array]:
@@ -223,11 +248,16 @@ class ImplicitRun(ForceRun):
         common["kinetic_nu"] = self.solver.kinetic(rates)
         self._measure(rates)
         work, support, lost = float(sums[3]), float(sums[4]) + self.support_work, float(sums[0])
+        if self.steps:
+            # The half kick before t_n, which order 1 has not.
+            both = problem.kernels.v + rates
+            work += 0.5 * self.s * self.step * problem.load_power(self.amplitude(self.time), both)
+        still = self.solver.kinetic(np.zeros_like(rates)) if problem.convexity is not None else 0.0
         energy = sum(common[n] for n in ("kinetic_u", "kinetic_nu", "stored", "potential"))
         return Entries(
             **common, work=work, support_work=support, dissipated=lost,
             surplus=energy - work - support + lost, discrete=0.0, flows=0.0, size=0.0,
-            variation_u=float(sums[1]), variation_nu=float(sums[2]),
+            variation_u=float(sums[1]), variation_nu=float(sums[2]), still=still,
         )  # fmt: skip
 
     def _measure(self, rates: Array) -> None:

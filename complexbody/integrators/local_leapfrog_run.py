@@ -68,8 +68,13 @@ class LocalLeapfrogRun(SynchronousRun):
         if self.levels:
             self._make(gamma, plan.level[disc.dof])
         self.watch()
-        if self.levels and self.activity is not None:
-            self._held.activity = ctypes.addressof(self.activity.state)
+
+    def watch(self, moving: npt.NDArray[np.bool_] | None = None) -> None:
+        """Skip what is quiet from now on, if enough is, at all levels; between steps."""
+        super().watch(moving)
+        if self.levels:
+            activity = self.activity
+            self._held.activity = None if activity is None else ctypes.addressof(activity.state)
 
     def _make(self, gamma: float, level: octaves.Ints) -> None:
         problem, kernels, L = self.problem, self.problem.kernels, self.levels

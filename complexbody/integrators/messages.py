@@ -26,9 +26,7 @@ class Message:
         world: What the C functions read; c: the functions.
     """
 
-    def __init__(
-        self, halo: Halo, rows: npt.NDArray[np.int32], world: Any, c: ctypes.CDLL
-    ) -> None:
+    def __init__(self, halo: Halo, rows: npt.NDArray[np.int32], world: Any, c: ctypes.CDLL) -> None:
         self.halo, self._rows, self._world, self._c = halo, rows, world, c
         self._sends = np.ascontiguousarray(rows[halo.sends], dtype=np.int32)
         count, place = ctypes.c_int64(len(rows)), native.pointer(rows)

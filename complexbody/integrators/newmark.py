@@ -19,6 +19,7 @@ from petsc4py import PETSc
 from complexbody import _compat
 from complexbody.integrators.global_newton import REASONS
 from complexbody.integrators.peer_run import PeerRun
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.solvers import KRYLOV, Operator, options, unsolved
 from complexbody.problem import Problem
 
@@ -98,6 +99,13 @@ class NewmarkRun(PeerRun):
         self.v = self._fixed_v + gamma * h * new
         self.a = new.copy()
         return ""
+
+    def _add(self, saved: Snapshot) -> None:
+        saved.nodes["a"] = self._record(self.a)
+        saved.numbers["newton"] = self.newton
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.a, self.newton = self.system.owned(saved.nodes["a"]), int(saved.numbers["newton"])
 
     def _place(self, factor: float, a: Array | None = None) -> None:
         """Q = x* + factor a, ghosts included."""

@@ -133,8 +133,12 @@ class NodalNewton:
         Nodes at rest are solved for in the first step, like all others: what is wrong there shows.
         """
         self.c.im_commit(ctypes.byref(self.state))
-        if self.run.activity is not None:
-            self.state.activity = ctypes.addressof(self.run.activity.state)
+        self.follow()
+
+    def follow(self) -> None:
+        """Skip nodes that the run's activity calls quiet, from now on."""
+        activity = self.run.activity
+        self.state.activity = None if activity is None else ctypes.addressof(activity.state)
 
     def momenta(self, rates: Array, out: Array) -> None:
         """∂χ/∂ν̇ at (ν, rates) integrated over each node's volume, shape (nodes, k)."""

@@ -19,6 +19,7 @@ from complexbody import native
 from complexbody.errors import SolverError
 from complexbody.integrators.entries import Entries, energies
 from complexbody.integrators.semidiscrete import Blocks, SemiDiscrete
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.solvers import last_line
 from complexbody.integrators.timetable import TimeSets
 from complexbody.problem import Problem
@@ -157,6 +158,42 @@ class PeerRun:
             rates = [(1.0, moved / h)] if not self.simpson else [n[1:] for n in nodes]
             for weight, rate in rates:
                 self.lost += h * weight * float(self.damping.times(rate, self._one) @ rate)
+
+    # --- what the future depends on --------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two steps; collective."""
+        system = self.system
+        saved = Snapshot(
+            {"steps": self.steps, "evaluations": system.evaluations, "linear": self.linear},
+            nodes={"x": self._record(system.x), "v": self._record(self.v)},
+            sums={"work": np.array([self.work, self.lost])},
+        )
+        self._add(saved)
+        return saved
+
+    def restore(self, saved: Snapshot) -> None:
+        """Go on from a snapshot of a run of the same scene, step and options; collective."""
+        system = self.system
+        system.set(saved.nodes["x"])
+        self.v = system.owned(saved.nodes["v"])
+        self.work, self.lost = (float(v) for v in saved.sums["work"])
+        self.steps = int(saved.numbers["steps"])
+        self._refresh(saved)
+        system.evaluations = int(saved.numbers["evaluations"])
+        self.linear = int(saved.numbers["linear"])
+
+    def _record(self, values: Array) -> Array:
+        """Node records (nodes, n) of owned unknowns; collective."""
+        out = np.zeros((self.problem.disc.nodes + 1, self.system.n))
+        self.system.write(values, out)
+        return out[:-1]
+
+    def _add(self, saved: Snapshot) -> None:
+        """Add what else a kind of run has to a snapshot; collective."""
+
+    def _refresh(self, saved: Snapshot) -> None:
+        """Take it from one; collective."""
 
     # --- what a user sees at t_n -----------------------------------------------------------------
 

@@ -181,9 +181,7 @@ class Theta(FirstOrder):
         fixed = run.system.fixed
         second[fixed] = self.operator.diagonal * dv[fixed]
 
-    def _jacobian(
-        self, ts: Any, t: float, y: Any, rate: Any, shift: float, J: Any, P: Any
-    ) -> None:
+    def _jacobian(self, ts: Any, t: float, y: Any, rate: Any, shift: float, J: Any, P: Any) -> None:
         system, self.shift = self.run.system, shift
         if not system.linear:
             system.x[:] = y.array_r[: self.size]

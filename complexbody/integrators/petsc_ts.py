@@ -51,7 +51,10 @@ class PetscRun(PeerRun):
     Attributes:
         ts: PETSc's object.
         form: The equations as the stepper wants them.
+        unsaved: Why there are no snapshots of it.
     """
+
+    unsaved = "PETSc's time steppers keep what a step needs of the last ones to themselves"
 
     def __init__(self, problem: Problem, method: PetscTS, step: float, critical: float) -> None:
         linear, explicit = problem.kernels.densities.linear, method.explicit

@@ -48,6 +48,7 @@ class Reached:
         c: A library with reached.c in it.
         schedule: Cells and their events; what is quiet is taken out of it.
         moving: Nodes that are not at zero, or that something acts on at any time (nodes,).
+        time: Start of the span to be scheduled next [s].
 
     Attributes:
         state: What the C functions read.
@@ -57,11 +58,11 @@ class Reached:
 
     def __init__(
         self, problem: Problem, c: ctypes.CDLL, schedule: ExactSchedule,
-        moving: npt.NDArray[np.bool_],
+        moving: npt.NDArray[np.bool_], time: float = 0.0,
     ) -> None:  # fmt: skip
         disc = problem.disc
         self.problem, self.on, self.count = problem, True, disc.count
-        self._c, self._ahead, self._time = c, ctypes.byref(schedule.state), 0.0
+        self._c, self._ahead, self._time = c, ctypes.byref(schedule.state), time
         c.cb_reached_begin.restype = c.cb_reached_skipped.restype = ctypes.c_int64
         cells = disc.blocks * disc.lanes
         nodes = disc.cells.transpose(0, 2, 1).reshape(cells, -1)
@@ -124,6 +125,21 @@ class Reached:
         """All cells act from now on: for who changes a run's state by hand, on all ranks."""
         self._all()
         self.on = False
+
+    def counters(self, known: Ints, steps: Array, t: float) -> Ints:
+        """j of the next event of all cells in blocks, those that are not scheduled too.
+
+        Args:
+            known: Of those that are (blocks, W).
+            steps: h_K (blocks, W) [s], infinite for padding.
+            t: Start of the next span [s].
+        """
+        quiet = (self._arrays["awake"].reshape(steps.shape) == 0) & np.isfinite(steps)
+        h = np.where(quiet, steps, 1.0)
+        j = np.maximum((t / h).astype(np.int64) - 1, 0)
+        for _ in range(3):  # as reached.c counts
+            j += j * h < t
+        return np.where(quiet, j, known)
 
     def skipped(self, t: float) -> int:
         """Events before t that were left out."""

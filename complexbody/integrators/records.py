@@ -20,6 +20,7 @@ from complexbody.integrators.activity import Counted
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.messages import Message
 from complexbody.integrators.record_books import entries
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.timetable import TimeSets
 from complexbody.kernels import events
 from complexbody.problem import Problem
@@ -284,6 +285,42 @@ class RecordRun(Counted):
         if key not in self._messages:
             self._messages[key] = Message(self.halo.part(rows), rows, self._world, self.c)
         return self._messages[key]
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two beats; arrays are views, valid until a beat; collective."""
+        saved = Snapshot(
+            {"steps": self.steps},
+            nodes={"record": self.record[:-1]},
+            sums={"sums": self.sums, "counts": self._counts(),
+                  "work": np.array([self.work, self.support_work])},
+        )  # fmt: skip
+        for name in ("force", "kinetic"):
+            values = getattr(self, f"_support_{name}")
+            saved.numbers[name] = self.problem.comm.allreduce(values is not None, op=MPI.LOR)
+            if saved.numbers[name]:
+                dense = np.zeros((self.problem.disc.nodes, self.problem.disc.n))
+                dense[self.problem.moving] = values
+                saved.nodes[name] = dense
+        return saved
+
+    def restore(self, saved: Snapshot) -> None:
+        """Go on from a snapshot of a run of the same scene, step and options; collective."""
+        own = self.record[:-1, self._inverse].copy()  # of this number of ranks, to the last bit
+        self.record[:-1] = saved.nodes["record"]
+        self.record[:-1, self._inverse] = own
+        self.sums[:] = saved.sums["sums"]
+        self.work, self.support_work = (float(v) for v in saved.sums["work"])
+        self.steps = int(saved.numbers["steps"])
+        for name in ("force", "kinetic"):
+            if saved.numbers[name]:
+                setattr(self, f"_support_{name}", saved.nodes[name][self.problem.moving])
+        self._refresh(saved)
+        self._recount(saved.sums["counts"])
+
+    def _refresh(self, saved: Snapshot) -> None:
+        """Take what else a kind of run has in a snapshot."""
 
     # --- what a user sees at a beat's end ------------------------------------------------------
 

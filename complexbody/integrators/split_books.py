@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from complexbody import native
 from complexbody.integrators.entries import Entries, energies, half_quadratic
+from complexbody.integrators.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from complexbody.integrators.split_run import SplitRun
@@ -56,6 +57,27 @@ class Books:
         momenta = np.einsum("aij,aj->ai", run.inertia, rates[:, run.n_u :])
         momenta = np.concatenate([run.heavy[:, None] * rates[:, : run.n_u], momenta], axis=1)
         return 0.5 * float(((rates * momenta)[rows, columns] * disc.owned[rows]).sum())
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def save(self, saved: Snapshot) -> None:
+        """Add the sums, and what the next step's identity needs of the last, to a snapshot."""
+        saved.sums["discrete"] = np.array([self.discrete, self.flows, self.size, self._supports])
+        saved.numbers["before"] = self._before is not None
+        if self._before is not None:
+            middle, rate, force, _ = self._before
+            saved.nodes |= {"middle": middle, "rate_before": rate, "force": force}
+
+    def restore(self, saved: Snapshot) -> None:
+        """Take them from one; the run's step and counter are set."""
+        self.discrete, self.flows, self.size, self._supports = (
+            float(v) for v in saved.sums["discrete"]
+        )
+        self._before = None
+        if saved.numbers["before"]:
+            h, nodes = self.run.step, saved.nodes
+            amplitude = self.run.amplitude((self.run.steps - 1) * h + 0.5 * h)
+            self._before = nodes["middle"], nodes["rate_before"], nodes["force"], amplitude
 
     # --- one step ------------------------------------------------------------------------------
 

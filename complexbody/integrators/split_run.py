@@ -38,6 +38,7 @@ from complexbody.errors import SolverError
 from complexbody.integrators.entries import Entries
 from complexbody.integrators.force_run import ForceRun
 from complexbody.integrators.nu_newton import NothingToSolve, NuNewton
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.split_books import Books
 from complexbody.masses import Masses, pencil_basis
 from complexbody.problem import Problem
@@ -191,6 +192,30 @@ class SplitRun(ForceRun):
         self.books.step(before)
         self.steps += 1
         self.ahead = False
+
+    # --- what the future depends on ------------------------------------------------------------
+
+    def snapshot(self) -> Snapshot:
+        """The run between two steps; arrays are views, valid until a step; collective."""
+        saved = super().snapshot()
+        saved.nodes |= {"rate": self.rate, "momentum": self.momentum}
+        saved.nodes |= {"drift": self._drifts[0], "drift_before": self._drifts[1]}
+        saved.numbers["ahead"] = self.ahead
+        numbers = [*(int(c) for c in self.count), self.linear]
+        saved.numbers |= dict(zip(("newton", "most", "solved", "linear"), numbers, strict=True))
+        self.books.save(saved)
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        self.rate[:], self.momentum[:] = saved.nodes["rate"], saved.nodes["momentum"]
+        self._drifts = saved.nodes["drift"].copy(), saved.nodes["drift_before"].copy()
+        self.books.restore(saved)
+        self.ahead = False
+        if saved.numbers["ahead"]:
+            self._look()
+        numbers = saved.numbers
+        self.count[:] = numbers["newton"], numbers["most"], numbers["solved"]
+        self.linear = int(numbers["linear"])
 
     # --- what a user sees at t_n ---------------------------------------------------------------
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from complexbody.integrators.activity import ENOUGH, Activity, active
 from complexbody.integrators.balance import Balance
 from complexbody.integrators.records import RecordRun
+from complexbody.integrators.snapshot import Snapshot
 from complexbody.integrators.timetable import per_cell, time_sets
 from complexbody.integrators.windows import WindowPlan
 from complexbody.kernels.events import RANGE
@@ -37,9 +38,7 @@ class WindowRun(RecordRun):
         count = per_cell(problem.disc, np.abs(problem.disc.group[:, None]))
         # Half kicks at both ends are one force more than events.
         ends = int(method.start == "trapezoidal" and not method.balanced)
-        self.time_sets = time_sets(
-            problem.disc, window / count, critical, window, count, ends=ends
-        )
+        self.time_sets = time_sets(problem.disc, window / count, critical, window, count, ends=ends)
         self.world.groups = ctypes.addressof(self.plan.groups)
         self._point(touched=self.plan.touched, touched_from=self.plan.touched_from)
         self.balance = Balance(self, self.plan) if method.balanced else None
@@ -48,17 +47,22 @@ class WindowRun(RecordRun):
         self._watch()
 
     def _watch(self) -> None:
-        """Skip what is quiet from now on, if enough is; before the first window."""
+        """Skip what is quiet from now on, if enough is; between windows."""
         problem, kernels, disc = self.problem, self.problem.kernels, self.problem.disc
+        self.activity, self.world.activity, self.skips_energies = None, None, False
         if not (problem.quiet and disc.blocks):
             return
-        stirred = (problem.initial_fields != 0) | (problem.initial_rates != 0)
-        stirred = stirred.any(axis=1)
+        stirred = (problem.initial_rates != 0).any(axis=1)
+        for part in range(3 if self.balance is not None else 2):  # positions, rates, accelerations
+            first = part * disc.record
+            stirred |= (self.record[:-1, first : first + disc.n] != 0).any(axis=1)
         stirred[self.acted] = True
         if active(disc.cells, stirred) > ENOUGH:
             return
         force, energetic = kernels.restless()
         restless = np.repeat(force, np.diff(disc.chunks[:, :2], axis=1).ravel())
+        if self.balance is not None:
+            restless = restless | self.balance.held.any(axis=(1, 2))
         ends = self.plan.chunk_ends
         awake = np.add.reduceat(restless, np.append(0, ends[:-1])) > 0
         ranges = np.append(np.arange(RANGE, disc.nodes, RANGE), disc.nodes)
@@ -66,6 +70,18 @@ class WindowRun(RecordRun):
         self.activity = Activity(self.c, ends, disc.cells, ranges, stirred, awake, late)
         self.world.activity = ctypes.addressof(self.activity.state)
         self.skips_energies = not energetic
+
+    def snapshot(self) -> Snapshot:
+        """The run between two windows, with the forces that its cells hold."""
+        saved = super().snapshot()
+        if self.balance is not None:
+            self.balance.save(saved)
+        return saved
+
+    def _refresh(self, saved: Snapshot) -> None:
+        if self.balance is not None:
+            self.balance.restore(saved)
+        self._watch()
 
     def advance(self, windows: int) -> None:
         """Do ``windows`` windows; collective."""
