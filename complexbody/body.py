@@ -56,7 +56,7 @@ class Body:
         rotation: How ν turns with the body (:mod:`complexbody.rotations`): then runs book angular
             momentum, and ``cb.objectivity`` checks the energy.
         parity: How ν goes under a mirror, if a :class:`complexbody.Symmetry` is to know: "polar",
-            "axial", "even", "odd", "tensor", or None.
+            "axial", "even", "odd", "tensor", ``f(Q)`` giving the k×k matrix of a mirror Q, or None.
         orientation: Stop a run in which a cell turns inside out, det(I + ∇u) ≤ 0; asked only of
             energies that are not quadratic in U. False for those that mean something there.
 
@@ -75,7 +75,7 @@ class Body:
     name: str = "body"
     constants: Mapping[str, float] = field(default_factory=dict)
     rotation: RotationAction | None = None
-    parity: str | None = None
+    parity: str | Callable[[Matrix], Matrix] | None = None
     orientation: bool = True
 
     def __post_init__(self) -> None:

@@ -116,7 +116,8 @@ class Symmetry:
         where: Facet tag(s), "boundary", or a predicate that holds at all vertices of a facet.
         parity: How ν goes under the mirror Q: "polar" (a vector, Qν), "axial" (a rotation, −Qν),
             "even" or "odd" (scalars), "tensor" (k = d² components ν_ij row by row, QνQᵀ), or the
-            k×k matrix R itself. By default what the body says (:attr:`complexbody.Body.parity`).
+            k×k matrix R itself, or ``f(Q)`` giving it. By default what the body says
+            (:attr:`complexbody.Body.parity`).
         normal: The axis, as a vector; by default the facets' normal.
         u: The same for u: "polar" by default; of one component in more than one dimension "even" or
             "odd" must be given.

@@ -43,6 +43,8 @@ def representation(parity: Any, mirror: Array, count: int, what: str) -> Array:
     Raises:
         SceneError: if the parity is not known or does not fit.
     """
+    if callable(parity):
+        parity = parity(mirror)
     if not isinstance(parity, str):
         matrix = np.atleast_2d(np.asarray(parity, dtype=np.float64))
         square = matrix.shape == (count, count) and np.all(np.isfinite(matrix))

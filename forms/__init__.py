@@ -4,6 +4,12 @@
 Each function returns a :class:`complexbody.body.Body` or raises a
 :class:`~complexbody.errors.BodyError` that names the inequality its constants break. Of each,
 ``body.dispersion(q)`` has the plane waves, ``body.scales(cell, size)`` the times of the fields.
+
+Bodies say what a mirror does to ν (``body.parity``), for planes of symmetry. They do not say how
+rotations turn it (``body.rotation``), though their energies, quadratic in ∇u, are invariant under
+small ones: every run would book an angular momentum, which supports and the viscosity ην̇ of
+rotations, directors and micro-deformations do not keep. Who wants it gives the action:
+``dataclasses.replace(body, rotation=cb.rotations.microrotation().about())``.
 """
 
 from complexbody.forms.bubbly import (

@@ -124,7 +124,8 @@ def cosserat(
     remedy = "Choose a larger alpha."
     require(family, "3*alpha + beta + gamma >= 0", polar, 0.0, remedy, strict=False)
     inertia = density * finite(family, {"j": micro_inertia})["j"]
-    return Body(3, _energy(3, 3, **c), density, inertia, viscosity, name=family, constants=c)
+    return Body(3, _energy(3, 3, **c), density, inertia, viscosity, name=family, constants=c,
+                parity="axial")  # fmt: skip
 
 
 def plane_cosserat(
@@ -146,4 +147,5 @@ def plane_cosserat(
     require(family, "gamma > 0", gamma, 0.0, "Choose a larger gamma.")
     inertia = density * finite(family, {"j": micro_inertia})["j"]
     energy = _energy(d, 1, **c)
-    return Body(1, energy, density, inertia, viscosity, displacement=d, name=family, constants=c)
+    return Body(1, energy, density, inertia, viscosity, displacement=d, name=family, constants=c,
+                parity="axial")  # fmt: skip

@@ -69,5 +69,6 @@ def hexagonal_quasicrystal(
     require(family, "C44*K2 > R3**2", C44 * K2, R3**2, remedy)
     energy = _energy(**constants)
     return Body(
-        1, energy, density, inertia, viscosity, displacement=1, name=name, constants=constants
-    )
+        1, energy, density, inertia, viscosity, displacement=1, name=name, constants=constants,
+        parity="even",
+    )  # fmt: skip

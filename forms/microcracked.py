@@ -13,7 +13,8 @@ of two fields (:mod:`complexbody.forms.two_field`) it may have, with ε = sym �
 
 all that is linear in ν⊗m and in ε and isotropic in both. Cracks of area s per volume whose faces
 part by ν take the strain s·sym(ν⊗m) off an elastic body: c1 = −λs and c2 = −2μs. Without m (cracks
-of all orientations) such terms are forbidden.
+of all orientations) such terms are forbidden. In the mirrors of planes that contain m, ν goes as a
+vector; the plane across m is no mirror where both the k3 and the c terms are there.
 
 *Coercive* on (sym U, ν, N): first as without cracks. Then ∇ν is eliminated, which leaves the
 moduli Λ = λ + 2μ/d − (k3 + k3'/d)²/(k1 + 2k2/d) of volume and G = μ − k3'²/(4k2) of shear; and
@@ -109,4 +110,4 @@ def microcracked(
     remedy = f"Choose k0 > {need:.9g}, or smaller |c1| and |c2|."
     require(family, "k0 > (c1 + c2/d)**2/L + c2**2*(1 - 1/d)/(2*G)", k0, need, remedy)
     return Body(d, _energy(d, m.tolist(), **constants), density, inertia, viscosity,
-                displacement=d, name=name, constants=constants)  # fmt: skip
+                displacement=d, name=name, constants=constants, parity="polar")  # fmt: skip

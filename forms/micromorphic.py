@@ -117,7 +117,7 @@ def micromorphic(
     remedy = f"Bring g1 nearer to {-2 * g2 / d:.9g}, or choose a larger lam or b1."
     require(family, inequality, macro * micro, shared**2, remedy)
     return Body(d * d, _energy(d, **constants), density, inertia, viscosity, displacement=d,
-                name=name, constants=constants)  # fmt: skip
+                name=name, constants=constants, parity="tensor")  # fmt: skip
 
 
 def mindlin_bar(

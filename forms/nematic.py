@@ -35,13 +35,18 @@ of One- and Two-Dimensional Order (1980); constants (r) recalled, not re-read.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import ufl
 
 from complexbody.body import Body
 from complexbody.errors import BodyError
 from complexbody.forms._admissible import Energy, finite, require, require_positive
+
+Array = npt.NDArray[Any]
 
 
 def _director(K: float, B: float) -> Energy:
@@ -74,7 +79,7 @@ def nematic_director(
     constants = finite("nematic_director", {"K": K, "bulk": bulk})
     require_positive("nematic_director", constants, ("K", "bulk"))
     return Body(1, _director(K, bulk), density, inertia, viscosity, displacement=1, name=name,
-                constants=constants)  # fmt: skip
+                constants=constants, parity="axial")  # fmt: skip
 
 
 def _elastomer(axis: int, lam: float, mu: float, D1: float, D2: float, K: float) -> Energy:
@@ -89,6 +94,12 @@ def _elastomer(axis: int, lam: float, mu: float, D1: float, D2: float, K: float)
         return own + 0.5 * D1 * sum(a**2 for a in lag) + D2 * shear
 
     return energy
+
+
+def _mirrored(axis: int, mirror: Array) -> Array:
+    """What a mirror does to ν: n + ν and −n − ν are one state, so ν⊗n goes as a tensor."""
+    across = [i for i in range(3) if i != axis]
+    return mirror[axis, axis] * mirror[np.ix_(across, across)]
 
 
 def nematic_elastomer(
@@ -124,4 +135,4 @@ def nematic_elastomer(
     remedy = f"Choose |D2| < {2 * (mu * D1) ** 0.5:.9g}, or a larger mu or D1."
     require(family, "4*mu*D1 > D2**2", 4 * mu * D1, D2**2, remedy)
     return Body(2, _elastomer(axis, **constants), density, inertia, viscosity, name=name,
-                constants=constants)  # fmt: skip
+                constants=constants, parity=partial(_mirrored, axis))  # fmt: skip

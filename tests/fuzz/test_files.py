@@ -62,7 +62,7 @@ BREAKS = [
 NOISE = [
     "print('hello')", "import warnings; warnings.warn('mind')", "x = 1", "", "# comment", "'text'",
     "__all__ = []", "__name__ = 'x'", "import sys; print('e', file=sys.stderr)", "import os",
-    "assert True", "def picture(result, path): pass", "cb.nothing = 3", "π = 3.14",
+    "assert True", "def picture(result, path): pass", "cb.also = 3", "π = 3.14",
     "def exact(t): 1",
 ]  # fmt: skip
 
