@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import os
 import struct
 import time
 from collections.abc import Callable, Iterator
@@ -63,18 +64,40 @@ def heal(place: Path, age: float = 0.0) -> list[str]:
         place: The cache.
         age: Seconds since its last change for a half made one to count as left behind.
     """
-    removed = []
-    for source in place.glob("libffcx_*.c"):
+    removed, names = [], os.listdir(place)  # once: caches hold thousands of files
+    ready = {name[: -len(".c.cached")] for name in names if name.endswith(".c.cached")}
+    libraries: dict[str, list[str]] = {}
+    for name in names:
+        if name.startswith("libffcx_") and name.endswith("so"):
+            libraries.setdefault(name.partition(".")[0], []).append(f"{place}/{name}")
+    for name in names:
+        stem = name.removesuffix(".c")
+        if stem == name or not name.startswith("libffcx_"):
+            continue
         with suppress(FileNotFoundError):
-            ready = source.with_suffix(".c.cached").exists()
-            libraries = list(place.glob(f"{source.stem}.*so"))
-            if ready and libraries and all(whole(library) for library in libraries):
+            found = libraries.get(stem, [])
+            if stem in ready and found and all(_sound(library) for library in found):
                 continue
-            if not ready and time.time() - source.stat().st_mtime < age:
+            if stem not in ready and time.time() - (place / name).stat().st_mtime < age:
                 continue
-            removed.append(source.stem)
-            remove(place, source.stem)
+            removed.append(stem)
+            remove(place, stem)
     return removed
+
+
+#: Libraries that this process has found whole, and what they were then: size and time.
+_known: dict[str, tuple[int, int]] = {}
+
+
+def _sound(library: str) -> bool:
+    """Whether a library is whole; looks into it once, and again after a change."""
+    status = os.stat(library)
+    state = status.st_size, status.st_mtime_ns
+    if _known.get(library) != state:
+        if not whole(Path(library)):
+            return False
+        _known[library] = state
+    return True
 
 
 def remove(place: Path, name: str) -> None:
