@@ -69,7 +69,8 @@ def _bodies(problem: Problem, numbering: Numbering) -> list[Any]:
         out.append(f"{body.name}: {rho}, {omega}, {body.viscosity_matrix.tolist()}")
     out.append(numbering.node_sum(disc.volume * disc.density()))
     if problem.convexity is not None:
-        out += [[float(v), abs(float(v))] for v in vars(problem.kinetic_range).values()]
+        known = vars(problem.kinetic_range).values()
+        out += [[v, abs(v)] for v in known if not isinstance(v, str)]  # places are words
     # Gradients of some thousandths, whatever the mesh.
     cells = problem.comm.allreduce(disc.count)
     size = (problem.comm.allreduce(float(disc.volume[disc.owned].sum())) / cells) ** (1 / disc.dim)

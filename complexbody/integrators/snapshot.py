@@ -31,7 +31,7 @@ class Snapshot:
         sums: Sums over this rank's share of the body (m,): the whole is their sum over ranks.
     """
 
-    numbers: dict[str, float]
+    numbers: dict[str, Any]
     nodes: dict[str, Array] = field(default_factory=dict)
     cells: dict[str, Array] = field(default_factory=dict)
     corners: dict[str, Array] = field(default_factory=dict)
