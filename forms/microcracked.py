@@ -2,8 +2,9 @@
 r"""Microcracked bodies: displacement u, descriptor ν the mean jump of u across a family of cracks.
 
 Cracks of one orientation with unit normal m. Turning m round turns the jump round: (m, ν) and
-(−m, −ν) are the same state, so that ν⊗m is what the body can feel, and besides the isotropic energy
-of two fields (:mod:`complexbody.forms.two_field`) it may have, with ε = sym ∇u, w = ∇ν,
+(−m, −ν) are the same state, so that ν⊗m is what the body can feel. Of the isotropic energy of two
+fields (:mod:`complexbody.forms.two_field`) that leaves out k3 and k3', zero by default: give them to
+cracks whose two faces differ. With ε = sym ∇u, w = ∇ν,
 
 .. math:: \rho e = \tfrac12\lambda(\mathrm{tr}\,\varepsilon)^2 + \mu|\varepsilon|^2
           + \tfrac12k_1(\mathrm{tr}\,w)^2 + k_2|\mathrm{sym}\,w|^2 + k_2'|\mathrm{skw}\,w|^2
@@ -62,7 +63,7 @@ def _energy(d: int, normal: Sequence[float], c1: float, c2: float, **rest: float
 
 def microcracked(
     lam: float = 1.0, mu: float = 1.0, k0: float = 1.0, k1: float = 0.5, k2: float = 0.5,
-    k2_skew: float = 0.25, k3: float = 0.2, k3_sym: float = 0.2, c1: float = -0.3,
+    k2_skew: float = 0.25, k3: float = 0.0, k3_sym: float = 0.0, c1: float = -0.3,
     c2: float = -0.6, normal: Sequence[float] | None = None, density: float = 1.0,
     inertia: float = 0.5, viscosity: float = 0.2, d: int = 3, name: str = "microcracked body",
 ) -> Body:  # fmt: skip
