@@ -37,8 +37,8 @@ class Prestress:
     Attributes:
         stress: P̄ [J/m³], shape (n_u, 3); self_action: z̄ (k,); microstress: S̄ (k, 3). Where a
             coefficient varies from cell to cell, the entries of largest magnitude.
-        relative: The strain that could feel them: largest ``|P̄|``/√(H_PP) (of z̄ and S̄ likewise, each
-            by its own stiffness) over √H of a unit strain; no units.
+        relative: The strain that could feel them: the largest magnitude of P̄ over √(H_PP) (of z̄
+            and S̄ likewise, each by its own stiffness) over √H of a unit strain; no units.
     """
 
     stress: Array

@@ -75,6 +75,8 @@ OPTIONS = {
     "--dense --out --no-picture --quiet --debug",
     "chart": "--set --until --methods --meshes --steps --repeats --budget --norm --out --fresh "
     "--quiet --debug",
+    "show": "--debug",
+    "resume": "--until --debug",
     "info": "--debug",
 }
 
