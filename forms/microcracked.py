@@ -3,8 +3,8 @@ r"""Microcracked bodies: displacement u, descriptor ν the mean jump of u across
 
 Cracks of one orientation with unit normal m. Turning m round turns the jump round: (m, ν) and
 (−m, −ν) are the same state, so that ν⊗m is what the body can feel. Of the isotropic energy of two
-fields (:mod:`complexbody.forms.two_field`) that leaves out k3 and k3', zero by default: give them to
-cracks whose two faces differ. With ε = sym ∇u, w = ∇ν,
+fields (:mod:`complexbody.forms.two_field`) that leaves out k3 and k3', zero by default: give them
+to cracks whose two faces differ. With ε = sym ∇u, w = ∇ν,
 
 .. math:: \rho e = \tfrac12\lambda(\mathrm{tr}\,\varepsilon)^2 + \mu|\varepsilon|^2
           + \tfrac12k_1(\mathrm{tr}\,w)^2 + k_2|\mathrm{sym}\,w|^2 + k_2'|\mathrm{skw}\,w|^2
