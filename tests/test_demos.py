@@ -30,15 +30,11 @@ SMALL = [
         ("--set", "dim=3", "--set", "refine=0.2", "--set", "grading=75", "--until", "0.5"),
         "local leapfrog",
     ),
-    ("decagonal_waves.py", ("--set", "cells=80"), "of dispersion"),
+    ("decagonal_waves.py", ("--set", "cells=120"), "of dispersion"),
     ("cosserat_beam.py", ("--set", "layers=6", "--until", "1e-4"), "of the formula"),
-    (
-        "band_gap.py",
-        ("--set", "cells=1800", "--set", "length=58", "--until", "80"),
-        "in the gap q within",
-    ),
+    ("band_gap.py", ("--set", "cells=2400"), "in the gap q within"),
     ("microcracked_plate.py", ("--set", "cells=80"), "of dispersion"),
-    ("nematic.py", ("--set", "cells=16"), "tilt grows at"),
+    ("nematic.py", ("--set", "cells=24"), "tilt grows at"),
     ("your_own_body.py", ("--set", "cells=600", "--until", "10"), "kinks have run"),
 ]
 
