@@ -16,6 +16,7 @@ from written import read
 
 import complexbody as cb
 from complexbody import statefile
+from complexbody.amplitudes import TRIED
 from complexbody.errors import CheckpointError, DivergenceError, OutputError
 from complexbody.together import Interrupted
 
@@ -101,7 +102,8 @@ class Signalling:
 
     def __call__(self, t):
         """The factor 1 at the times t."""
-        if np.max(t) > self.t and not SENT:
+        trial = np.size(t) == TRIED  # before the run, when nobody listens
+        if np.max(t) > self.t and not trial and not SENT:
             SENT.append(os.kill(os.getpid(), self.number))
         return np.ones_like(np.asarray(t, dtype=float))
 
