@@ -51,6 +51,7 @@ def radius(run):
 def spectral_radius(scene, method):
     """Of the undamped step map, from the forces that the run itself gives for unit fields."""
     run = prepared(scene, method)
+    run.wake()  # its state is set by hand
     disc, kernels = run.problem.disc, run.problem.kernels
     fixed = run.problem.masses.fixed[run.problem.masses.classes[:-1]]
     columns = []
