@@ -166,7 +166,9 @@ class Series:
             return
         before = self._open, self._content, self._count, self._sealed
         self._content.seek(0, io.SEEK_END)
-        if self._sealed or self._count >= STEPS or self._content.tell() + values.nbytes > BYTES:
+        full = self._count >= STEPS or self._content.tell() + values.nbytes > BYTES
+        # A file has one step at least: the first one, with a large mesh, would else be made anew.
+        if self._sealed or (full and self._count):
             self._open, self._content = self._file(len(self._steps)), io.BytesIO()
             self._count, self._sealed = 0, False
         else:

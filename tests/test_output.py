@@ -201,3 +201,23 @@ def test_schedule():
 def test_outputs_that_make_no_sense(wrong, error, says):
     with pytest.raises(error, match=says):
         Output("results", **wrong)
+
+
+def test_a_mesh_larger_than_a_file_should_be(comm, shared_path, monkeypatch):
+    """It stays in the first file, whatever the size of a step."""
+    import meshio
+
+    import complexbody as cb
+    from complexbody import series
+    from complexbody.forms import isotropic_two_field
+    from complexbody.meshes import rectangle
+
+    monkeypatch.setattr(series, "BYTES", 1)
+    scene = cb.Scene(rectangle(comm, (0, 0), (1, 1), 4), isotropic_two_field(d=2))
+    cb.simulate(scene, until=0.3, output=cb.Output(shared_path / "out", every=0.1))
+    if comm.rank == 0:
+        with meshio.xdmf.TimeSeriesReader(shared_path / "out" / "u.xdmf") as reader:
+            points, _ = reader.read_points_cells()
+            steps = [reader.read_data(i)[0] for i in range(reader.num_steps)]
+        assert len(points) == 25
+        np.testing.assert_allclose(steps, [0, 0.1, 0.2, 0.3], atol=1e-12)
