@@ -7,6 +7,7 @@ Here predicates and tags become nodes or facets, and prescribed values targets. 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +21,7 @@ from complexbody.action import Action
 from complexbody.amplitudes import Amplitudes, try_histories
 from complexbody.conditions import Symmetry
 from complexbody.errors import SceneError, agree
-from complexbody.given import numbers
+from complexbody.given import is_whole, numbers, short
 from complexbody.histories import Constant, History
 from complexbody.mirrors import fixed_components, mirror_plane
 from complexbody.predicates import mask as _mask
@@ -154,13 +155,15 @@ def _prescribe(scene: Scene, out: Supports, fix: Fix, nodes: Any, x: Any) -> Exc
     all_components = scene.components_of(fix.field)
     chosen = np.arange(len(all_components))
     if fix.components is not None:
-        chosen = np.atleast_1d(np.asarray(fix.components))
-        if not np.all(np.isin(chosen, np.arange(len(all_components)))) or chosen.size == 0:
+        given = fix.components if isinstance(fix.components, Sequence | np.ndarray) else ()
+        given = [fix.components] if is_whole(fix.components) else list(given)
+        ok = given and all(map(is_whole, given)) and set(given) <= set(chosen)
+        if not ok or len(set(given)) < len(given):
             return SceneError(
-                f"Fix({fix.field!r}): components {fix.components} do not exist; the field has "
-                f"{len(all_components)}, counted from 0. Give some of those."
+                f"Fix({fix.field!r}): components={short(fix.components)} are none of this field, "
+                f"which has {len(all_components)}, counted from 0. Give some of those, each once."
             )
-    chosen = chosen.astype(np.int64)
+        chosen = np.array(given, dtype=np.int64)
     try:
         values = _values(fix.value, x[nodes], len(chosen))
     except Exception as found:  # a user's callable may fail in any way
@@ -196,22 +199,26 @@ def _prescribe(scene: Scene, out: Supports, fix: Fix, nodes: Any, x: Any) -> Exc
 
 
 def _values(value: Any, points: Array, count: int) -> Array | None:
-    """Values (points, count) of a number, a sequence or a callable of x; None if they misfit."""
+    """Values (points, count) of numbers or a callable of x; None if they misfit.
+
+    A single number, of all points or each, is that of all components.
+    """
     if not len(points):
         return np.zeros((0, count))  # ranks without points have nothing to ask
-    found = value(points.T) if callable(value) else value
-    mask = callable(value) and np.asarray(found).dtype == np.bool_  # a predicate means 0 and 1
-    given = numbers(np.asarray(found, dtype=np.int64) if mask else found)
-    if given is None:
+    if callable(value):
+        # With as many points as components, a number for each of the ones passed for the others.
+        x = points if len(points) != count else np.vstack([points, points[-1:]])
+        found = value(x.T)
+        mask = np.asarray(found).dtype == np.bool_  # a predicate means 0 and 1
+        given = numbers(np.asarray(found, dtype=np.int64) if mask else found)
+        fits = given is not None and given.shape in ((), (len(x),), (count, len(x)))
+    else:
+        given, x = numbers(value), points
+        fits = given is not None and given.shape in ((), (count,))
+        given = given[..., None] if fits else None
+    if given is None or not fits or not np.all(np.isfinite(given)):
         return None
-    try:
-        if callable(value):
-            given = np.broadcast_to(np.atleast_2d(given), (count, len(points))).T
-        else:
-            given = np.broadcast_to(given, (len(points), count))
-    except ValueError:
-        return None
-    return given if np.all(np.isfinite(given)) else None
+    return np.array(np.broadcast_to(given, (count, len(x))).T[: len(points)])
 
 
 def initial(scene: Scene, action: Action) -> tuple[Array, Array]:

@@ -9,6 +9,7 @@ later cell needs it. Knows no energy and no integrator.
 
 from __future__ import annotations
 
+import copy
 from functools import cached_property
 from typing import Any
 
@@ -131,6 +132,17 @@ class Discretisation:
         self.position[:-1] = x[self.dof]
         if self.identified is not None:
             self.position[:-1] = self.identified.placed(self.dof)
+
+    def reduced(self, scene: Scene) -> Discretisation:
+        """This layout for a scene that differs in its components alone; arrays are shared.
+
+        Its messages go over a communicator of its own; collective.
+        """
+        out = copy.copy(self)
+        out.scene, out.n = scene, scene.components
+        out.record = padded(out.n)
+        out.halo = self.halo.widened(out.record)
+        return out
 
     def _check_cells(self, edges: Array, nodes: Any, x: Array) -> None:
         error: Exception | None = None

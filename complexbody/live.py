@@ -24,7 +24,7 @@ from ufl.algorithms.map_integrands import map_expr_dag
 from ufl.classes import Zero
 from ufl.corealg.multifunction import MultiFunction
 
-from complexbody import hessian
+from complexbody.kernels.library import Densities
 from complexbody.scene import Scene
 
 Array = npt.NDArray[np.float64]
@@ -51,18 +51,21 @@ class Live:
         return len(self.components) == self.total
 
 
-def live(scene: Scene, supports: Any, loads: Any, start: tuple[Array, Array]) -> Live:
+def live(
+    scene: Scene, densities: Densities, supports: Any, loads: Any, start: tuple[Array, Array]
+) -> Live:
     """The components that a source reaches; collective, the same on all ranks.
 
     Args:
         scene: The scene.
+        densities: What reading its energies found.
         supports: Its :class:`complexbody.boundary.Supports`.
         loads: Its :class:`complexbody.loading.Loads`.
         start: Initial fields and rates (geometry nodes, n).
     """
     n = scene.components
     sources = _from_data(scene, supports, loads, start)
-    links, nonlinear = _couplings(scene, sources)
+    links, nonlinear = _couplings(scene, densities, sources)
     reached = _closure(set(sources), links)
     while reached and len(reached) < n:
         driven = set().union(*(_driven(d, values, scene, reached) for d, values in nonlinear))
@@ -91,7 +94,7 @@ def _from_data(
 
 
 def _couplings(
-    scene: Scene, sources: dict[int, str]
+    scene: Scene, densities: Densities, sources: dict[int, str]
 ) -> tuple[list[set[int]], list[tuple[Density, str]]]:
     """Sets of coupled components, and densities to be looked at by :func:`_driven`.
 
@@ -104,12 +107,13 @@ def _couplings(
     def component(i: int) -> int:
         return i // 3 if i < 3 * n else i - 3 * n
 
-    for body in scene.bodies:
-        parts = [(body.energy, "gradients"), (body.potential, "fields")]
-        for density, values in parts:
+    for body, stored, outer in zip(
+        scene.bodies, densities.stored, densities.potential, strict=True
+    ):
+        parts = [(body.energy, "gradients", stored), (body.potential, "fields", outer)]
+        for density, values, found in parts:
             if density is None:
                 continue
-            found = hessian.read(density, scene.mesh, n_u, k, values)
             if found is None:
                 nonlinear.append((density, values))
                 for i in _driven(density, values, scene, set()):

@@ -94,7 +94,9 @@ class Problem:
         self.live = Live(tuple(range(scene.components)), {}, scene.components)
         self.full: Problem = self
         if reduce:
-            self.live = live(self.scene, self.supports, self.loads, self.start)
+            self.live = live(
+                self.scene, self.kernels.densities, self.supports, self.loads, self.start
+            )
         if not self.live.all:
             self._reduce()
 
@@ -102,7 +104,6 @@ class Problem:
         """Leave out components that no source reaches."""
         self.full = full = copy.copy(self)
         full.full, full.live = full, replace(self.live, components=tuple(range(self.live.total)))
-        del self.disc  # the other one's, from now on
         self.supports, self.loads, self.start = reduced_data(
             self.live, self.supports, self.loads, self.start
         )
@@ -114,6 +115,13 @@ class Problem:
         self.scene = reduced_scene(self.whole, self.live)
         self.action = Action(self.scene)
         self._read_inertia()
+        # The layout is the other one's, with smaller records: nothing of it is computed anew.
+        late = [np.any(p.supports.moving, axis=1) for p in (self, full)]
+        if self.comm.allreduce(np.array_equal(*late), op=MPI.LAND):
+            self.disc = full.disc.reduced(self.scene)
+            self.kernels = Kernels(self.action, self.disc)
+        else:
+            del self.disc
         self.arrange()
 
     def release(self) -> None:

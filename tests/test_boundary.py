@@ -190,6 +190,12 @@ def _on_last_rank(comm, function):
     return lambda x: function(x) if comm.rank == comm.size - 1 else np.zeros(x.shape[1], bool)
 
 
+def _two_nodes(x):
+    """The ends of an edge of the box."""
+    z = np.minimum(np.abs(x[2]), np.abs(x[2] - SIZE[2]))
+    return np.abs(x[0]) + np.abs(x[1]) + z < 1e-9
+
+
 def _fail(x):
     raise RuntimeError("no such luck")
 
@@ -225,10 +231,18 @@ def _fail(x):
         ),
         (lambda c: cb.Fix("nu", "boundary", value=(1.0, 2.0, 3.0)), ("Fix('nu')", "2 finite")),
         (lambda c: cb.Fix("nu", "boundary", value="much"), ("Fix('nu')", "much")),
-        (lambda c: cb.Fix("nu", "boundary", components=2), ("Fix('nu')", "components 2", "has 2")),
+        (lambda c: cb.Fix("nu", "boundary", components=2), ("Fix('nu')", "components=2", "has 2")),
         (lambda c: cb.Fix("u", "boundary", components=(-1, 0)), ("Fix('u')", "(-1, 0)")),
         (lambda c: cb.Fix("u", "boundary", components=0.5), ("Fix('u')", "0.5")),
         (lambda c: cb.Fix("u", "boundary", components=()), ("Fix('u')", "()")),
+        *(
+            (lambda c, given=given: cb.Fix("u", "boundary", components=given), ("each once",))
+            for given in ((0, 0), [[0]], True, [False], np.array([[0, 1]]))
+        ),
+        (lambda c: cb.Fix("nu", "boundary", value=lambda x: x[:1]), ("Fix('nu')", "2 finite")),
+        (lambda c: cb.Fix("nu", "boundary", value=[[1.0, 2.0]]), ("Fix('nu')", "2 finite")),
+        # As many nodes as components: not a number for each node by chance.
+        (lambda c: cb.Fix("nu", _two_nodes, value=lambda x: (1.0, 2.0)), ("Fix('nu')", "2 finite")),
     ],
 )
 def test_supports_that_fail(comm, fix, words):

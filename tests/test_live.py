@@ -13,6 +13,7 @@ import complexbody as cb
 from complexbody import boundary, loading, meshes
 from complexbody.action import Action
 from complexbody.errors import CoercivityError
+from complexbody.kernels.library import Densities
 from complexbody.live import live
 from complexbody.problem import Problem
 
@@ -56,7 +57,8 @@ def reached(scene):
     """Live components, without making anything ready to run."""
     action = Action(scene)
     data = boundary.supports(scene, action), loading.loads(scene, action)
-    return list(live(scene, *data, boundary.initial(scene, action)).components)
+    found = live(scene, Densities(action), *data, boundary.initial(scene, action))
+    return list(found.components)
 
 
 def components(scene):

@@ -6,7 +6,6 @@ Nothing that was written is lost, and a resumed run ends as one that was never k
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -22,10 +21,16 @@ pytestmark = [pytest.mark.serial, pytest.mark.slow]
 
 FIELDS = ("u", "nu", "stress")
 SCENE = '''
+import os, resource
 import numpy as np
 import complexbody as cb
 from complexbody import meshes
 from complexbody.forms import isotropic_two_field
+
+# As if the disk were full, once MPI has the files that it needs.
+if "FILE_LIMIT" in os.environ:
+    most = int(os.environ["FILE_LIMIT"]), resource.RLIM_INFINITY
+    resource.setrlimit(resource.RLIMIT_FSIZE, most)
 
 def scene(comm, cells=12):
     return cb.Scene(
@@ -43,15 +48,12 @@ def started(words, ranks, limit=None):
     """A process of the command line, the first of a session, whose files may have so many bytes."""
     extra = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
     mpirun = ["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks)]
-
-    def limited():
-        if limit is not None:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
-
+    if limit is not None:
+        extra["FILE_LIMIT"] = str(limit)
     return subprocess.Popen(
         [*(mpirun if ranks > 1 else []), sys.executable, "-m", "complexbody", *map(str, words)],
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-        env={**os.environ, **extra}, preexec_fn=limited,
+        env={**os.environ, **extra},
     )  # fmt: skip
 
 
@@ -64,7 +66,8 @@ def killed(process, folder, rng, spread):
     while time.monotonic() < deadline and process.poll() is None:
         time.sleep(0.001)
     if process.poll() is not None:
-        assert process.returncode == 0, process.communicate()[0]
+        text = process.communicate()[0]
+        assert process.returncode == 0, text
         return False
     # All ranks at once, and mpirun before them, lest it puts things in order.
     os.kill(process.pid, signal.SIGSTOP)
