@@ -38,8 +38,9 @@ from complexbody.pilots import Moment, Piece, Pilots, attempt, moment_of
 from complexbody.precheck import limits
 from complexbody.problem import Problem
 from complexbody.result import Result
+from complexbody.runoptions import check_options
 from complexbody.scene import Scene
-from complexbody.simulate import Simulation, check_options
+from complexbody.simulation import Simulation
 
 Array = npt.NDArray[np.float64]
 
@@ -76,7 +77,7 @@ class Accurate:
         asked: Relative error to meet.
         integrator: None: it is chosen.
         until: End of the run [s].
-        options: As for :class:`complexbody.simulate.Simulation`.
+        options: As for :class:`complexbody.simulation.Simulation`.
 
     Attributes:
         simulation: The simulation, ready to run; looks: how often this looks at it.

@@ -22,8 +22,33 @@ from complexbody import _compat
 from complexbody.body import Body
 from complexbody.densities import scalar
 from complexbody.errors import BodyError, SceneError, agree
-from complexbody.given import is_finite, short
+from complexbody.given import finite, is_finite, numbers, short
 from complexbody.scene import BodyForce, Pressure, Scene, Traction
+
+
+def _nodal(found: Any, count: int, points: int, what: str) -> Any:
+    """What a user's callable gave, as (components, points).
+
+    Raises:
+        SceneError: for another shape: what is merely turned round would be taken otherwise.
+    """
+    given = numbers(found)
+    if given is None:  # rows of which some are single numbers
+        rows = [numbers(row) for row in found] if isinstance(found, Sequence) else []
+        each = [r for r in rows if r is not None and r.shape in ((), (points,))]
+        if len(each) == len(rows) == count:
+            given = np.array([np.broadcast_to(row, points) for row in each])
+    elif given.shape == (count,):
+        given = np.repeat(given[:, None], points, axis=1)
+    elif count == 1 and given.shape in ((), (points,)):
+        given = np.broadcast_to(given, (1, points))
+    if given is None or given.shape != (count, points):
+        shape = "no numbers" if given is None else f"shape {given.shape}"
+        raise SceneError(
+            f"{what}: vector(x) gave {shape} for x of shape (3, {points}). Give {count} "
+            f"component(s): shape ({count}, {points})."
+        )
+    return given
 
 
 def _columns(gradient: Any, rows: Sequence[int], dim: int) -> Any:
@@ -175,12 +200,12 @@ class Action:
     def _vector(self, value: Any, count: int, what: str) -> Any:
         if callable(value):
             function = fem.Function(_compat.vector_space(self.scene.mesh, count))
-            function.interpolate(lambda x: np.asarray(value(x), dtype=float).reshape(count, -1))
+            function.interpolate(lambda x: _nodal(value(x), count, x.shape[1], what))
             return function
-        numbers = np.atleast_1d(np.asarray(value, dtype=np.float64))
-        if numbers.shape != (count,) or not np.all(np.isfinite(numbers)):
+        given = finite(value)
+        if given is None or np.atleast_1d(given).shape != (count,):
             raise SceneError(
-                f"{what}: vector {value!r} does not have {count} finite components. Give one "
+                f"{what}: vector {short(value)} does not have {count} finite components. Give one "
                 "number per component of the field."
             )
-        return fem.Constant(self.scene.mesh, numbers)
+        return fem.Constant(self.scene.mesh, np.atleast_1d(given))

@@ -155,8 +155,9 @@ def _prescribe(scene: Scene, out: Supports, fix: Fix, nodes: Any, x: Any) -> Exc
     all_components = scene.components_of(fix.field)
     chosen = np.arange(len(all_components))
     if fix.components is not None:
-        given = fix.components if isinstance(fix.components, Sequence | np.ndarray) else ()
-        given = [fix.components] if is_whole(fix.components) else list(given)
+        components: Any = fix.components
+        several = isinstance(components, Sequence | np.ndarray)
+        given = list(components) if several else [components]
         ok = given and all(map(is_whole, given)) and set(given) <= set(chosen)
         if not ok or len(set(given)) < len(given):
             return SceneError(
@@ -215,7 +216,7 @@ def _values(value: Any, points: Array, count: int) -> Array | None:
     else:
         given, x = numbers(value), points
         fits = given is not None and given.shape in ((), (count,))
-        given = given[..., None] if fits else None
+        given = None if given is None else given[..., None]
     if given is None or not fits or not np.all(np.isfinite(given)):
         return None
     return np.array(np.broadcast_to(given, (count, len(x))).T[: len(points)])

@@ -42,7 +42,8 @@ from complexbody.result import Result
 from complexbody.runfolder import recorded_words
 from complexbody.scene import Scene
 from complexbody.scenefile import CheckFailed, SceneFile, assignments, points
-from complexbody.simulate import Simulation, default_ledger_steps
+from complexbody.simulation import Simulation
+from complexbody.stepping import default_ledger_steps
 from complexbody.together import Interrupted, say, together
 
 #: Integrators by the name that --integrator takes; the first is the default.

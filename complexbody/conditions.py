@@ -11,9 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from complexbody.errors import SceneError
+from complexbody.given import finite, is_positive, short
 from complexbody.histories import Constant, History
 
 #: A facet tag, several of them, "boundary", or a predicate of x (3, npts) -> bool (npts,).
@@ -64,8 +63,10 @@ class Absorb:
         if self.field is not None:
             known_field("Absorb", self.field)
         f = self.frequency
-        if f is not None and not (np.isfinite(f) and f > 0):
-            raise SceneError(f"Absorb: frequency is {f}. Give a positive number of Hz, or None.")
+        if f is not None and not is_positive(f):
+            raise SceneError(
+                f"Absorb: frequency is {short(f)}. Give a positive number of Hz, or None."
+            )
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,10 @@ class PointSource:
         known_field("PointSource", self.field)
         if self.vector is None and self.moment is None:
             raise SceneError("PointSource: it has no vector and no moment. Give one of them.")
-        if not np.all(np.isfinite(np.asarray(self.at, dtype=np.float64))):
-            raise SceneError(f"PointSource: at={self.at!r} is no point. Give finite coordinates.")
+        if finite(self.at) is None:
+            raise SceneError(
+                f"PointSource: at={short(self.at)} is no point. Give finite coordinates."
+            )
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,12 @@ def numbers(value: Any) -> npt.NDArray[np.float64] | None:
     return array.astype(np.float64)
 
 
+def finite(value: Any) -> npt.NDArray[np.float64] | None:
+    """An array of finite numbers as floats, whatever its shape; None if it is none."""
+    array = numbers(value)
+    return array if array is not None and np.all(np.isfinite(array)) else None
+
+
 def short(value: Any) -> str:
     """A value in a message: its text, cut where it is long."""
     try:

@@ -131,12 +131,15 @@ class Bookkeeper:
 
     def state(self) -> dict[str, float | None]:
         """What later rows depend on besides the run."""
-        return {name: getattr(self, f"_{name}") for name in ("start", "put", "reference", "size")}
+        kept = {name: getattr(self, f"_{name}") for name in ("start", "put", "reference", "size")}
+        return {**kept, "still": self._still[0]}
 
     def restore(self, state: Mapping[str, float | None], rows: Array) -> None:
         """Go on from a state and the rows so far (rows, columns)."""
-        for name, value in state.items():
-            setattr(self, f"_{name}", value)
+        still = state["still"] or 0.0
+        self._start, self._reference = state["start"], state["reference"]
+        self._put, self._size = state["put"] or 0.0, state["size"] or 0.0
+        self._still = still, still
         self.ledger.rows[:] = rows.tolist()
 
     def _guard(self, excess: float) -> None:

@@ -18,6 +18,7 @@ from complexbody import _compat
 from complexbody.conditions import Symmetry
 from complexbody.errors import SceneError, agree
 from complexbody.facets import exterior
+from complexbody.given import finite, short
 
 if TYPE_CHECKING:
     from complexbody.problem import Problem
@@ -46,8 +47,9 @@ def representation(parity: Any, mirror: Array, count: int, what: str) -> Array:
     if callable(parity):
         parity = parity(mirror)
     if not isinstance(parity, str):
-        matrix = np.atleast_2d(np.asarray(parity, dtype=np.float64))
-        square = matrix.shape == (count, count) and np.all(np.isfinite(matrix))
+        given = finite(parity)
+        matrix = np.zeros(0) if given is None else np.atleast_2d(given)
+        square = matrix.shape == (count, count)
         if not square or np.abs(matrix @ matrix - np.eye(count)).max(initial=0.0) > 1e-12:
             raise SceneError(
                 f"Symmetry: the parity of {what} is no {count}×{count} matrix whose square is one. "
@@ -67,8 +69,9 @@ def representation(parity: Any, mirror: Array, count: int, what: str) -> Array:
         made = np.kron(mirror[:d, :d], mirror[:d, :d])
     if made is None:
         raise SceneError(
-            f"Symmetry: {parity!r} is no parity of the {count} components of {what}. Give 'polar' "
-            "(three at most), 'axial' (one or three), 'even', 'odd', 'tensor' (d²), or a matrix."
+            f"Symmetry: {short(parity)} is no parity of the {count} components of {what}. Give "
+            "'polar' (three at most), 'axial' (one or three), 'even', 'odd', 'tensor' (d²), "
+            "or a matrix."
         )
     return made + 0.0
 
@@ -91,12 +94,13 @@ def mirror_plane(scene: Scene, symmetry: Symmetry, facets: Ints) -> int:
             "coordinate axis, and supports fix components. Change the mesh, or select one plane."
         )
     if symmetry.normal is not None and error is None:
-        given = np.zeros(3)
-        given[: np.size(symmetry.normal)] = np.ravel(symmetry.normal)[:3]
-        size = float(np.linalg.norm(given))
-        if not (np.isfinite(size) and size > 0 and abs(given[axis]) >= size * (1 - 1e-10)):
+        given = finite(symmetry.normal)
+        normal = np.zeros(0) if given is None else np.atleast_1d(given)
+        size = float(np.linalg.norm(normal))
+        fits = normal.shape in ((mesh.geometry.dim,), (3,)) and size > 0
+        if not fits or abs(normal[axis]) < size * (1 - 1e-10):
             error = SceneError(
-                f"Symmetry: normal={symmetry.normal!r}, but the facets are perpendicular to "
+                f"Symmetry: normal={short(symmetry.normal)}, but the facets are perpendicular to "
                 f"{AXES[axis]}. Give that axis, or leave it out."
             )
     agree(mesh.comm, error)

@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 
 from complexbody import _compat
 from complexbody.errors import IntegratorError, MeshError, SceneError, agree
+from complexbody.given import finite, is_whole, short
 from complexbody.matching import Boundary, match
 from complexbody.predicates import mask
 
@@ -49,11 +50,11 @@ class Periodic:
     vector: Sequence[float]
 
     def __post_init__(self) -> None:
-        v = np.asarray(self.vector, dtype=np.float64)
-        if v.ndim != 1 or not (np.all(np.isfinite(v)) and np.any(v)):
+        v = finite(self.vector)
+        if v is None or v.ndim != 1 or not np.any(v):
             raise SceneError(
-                f"Periodic: vector is {self.vector!r}. Give one number per dimension of the mesh, "
-                "not all of them zero."
+                f"Periodic: vector is {short(self.vector)}. Give one number per dimension of "
+                "the mesh, not all of them zero."
             )
 
 
@@ -74,11 +75,10 @@ def checked(periodic: Any, dim: int) -> tuple[int | Periodic, ...]:
                 )
             out.append(thing)
             continue
-        whole = isinstance(thing, int | np.integer) and not isinstance(thing, bool)
-        if not whole or not 0 <= thing < dim or int(thing) in out:
+        if not is_whole(thing) or not 0 <= thing < dim or int(thing) in out:
             raise SceneError(
-                f"Scene: periodic has {thing!r}. Give each axis of the mesh (0 to {dim - 1}) once, "
-                "or cb.Periodic(where, vector)."
+                f"Scene: periodic has {short(thing)}. Give each axis of the mesh (0 to {dim - 1}) "
+                "once, or cb.Periodic(where, vector)."
             )
         out.append(int(thing))
     return tuple(out)

@@ -20,6 +20,7 @@ import numpy.typing as npt
 from complexbody import _compat
 from complexbody.conditions import PointSource
 from complexbody.errors import SceneError
+from complexbody.given import finite, short
 from complexbody.scene import Scene
 
 Array = npt.NDArray[np.float64]
@@ -92,21 +93,24 @@ def _shaped(source: PointSource, count: int) -> tuple[Array, Array]:
     """F (count,) and M (count, 3) of a source."""
     vector, moment = np.zeros(count), np.zeros((count, 3))
     if source.vector is not None:
-        given = np.ravel(np.asarray(source.vector, dtype=np.float64))
-        if given.shape != (count,) or not np.all(np.isfinite(given)):
+        given = finite(source.vector)
+        if given is None or np.atleast_1d(given).shape != (count,):
             raise SceneError(
-                f"PointSource: vector {source.vector!r} does not have {count} finite components. "
-                "Give one number per component of the field."
+                f"PointSource: vector {short(source.vector)} does not have {count} finite "
+                "components. Give one number per component of the field."
             )
-        vector = given
+        vector = np.atleast_1d(given)
     if source.moment is not None:
-        table = np.atleast_2d(np.asarray(source.moment, dtype=np.float64))
+        given = finite(source.moment)
+        if given is None:
+            raise SceneError(
+                f"PointSource: moment is {short(source.moment)}. Give finite numbers."
+            )
+        table = np.atleast_2d(given)
         if table.ndim != 2 or len(table) != count or table.shape[1] > 3:
             raise SceneError(
                 f"PointSource: moment has shape {table.shape}, but the field has {count} "
                 "components. Give one row for each, with a column per direction."
             )
-        if not np.all(np.isfinite(table)):
-            raise SceneError("PointSource: moment is not finite. Give finite numbers.")
         moment[:, : table.shape[1]] = table
     return vector, moment

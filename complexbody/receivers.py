@@ -21,19 +21,17 @@ Array = npt.NDArray[np.float64]
 
 
 class Receivers:
-    """Probes of a run; opened, recorded, flushed and closed collectively.
+    """Probes of a run; made, opened, recorded, flushed and closed collectively.
 
     Args:
         problem: The scene, made ready, whose node records are probed.
-        output: Names the probes and the folder.
-        resume: Keep an earlier run's rows up to this time [s]; None keeps none.
+        output: Names the probes.
 
     Raises:
         SceneError: for points outside the body.
-        OutputError: if the tables cannot be written.
     """
 
-    def __init__(self, problem: Problem, output: Output, resume: float | None = None) -> None:
+    def __init__(self, problem: Problem, output: Output) -> None:
         scene, disc, self._problem = problem.whole, problem.disc, problem
         self.probes, self.n, self.n_u = (
             Probes(scene, output.probes), scene.components, scene.displacement,
@@ -43,10 +41,26 @@ class Receivers:
         self._rows: list[Array] = []
         self._times: list[float] = []
         self._done: list[Array] = []  # on rank 0: (rows, 1 + probes · n)
+        self._tables: list[CsvWriter] = []
+
+    @classmethod
+    def of(cls, problem: Problem, output: Output) -> Receivers | None:
+        """Those of an output, None if it names no probes."""
+        return cls(problem, output) if output.probes else None
+
+    def open(self, folder: Path, resume: float | None = None) -> None:
+        """Make the tables.
+
+        Args:
+            folder: Where.
+            resume: Keep an earlier run's rows up to this time [s]; None keeps none.
+
+        Raises:
+            OutputError: if they cannot be written.
+        """
         labels = [f"u{j + 1}" for j in range(self.n_u)]
         labels += [f"nu{j + 1}" for j in range(self.n - self.n_u)]
         columns = {"time": "s", **{a: "" if a.startswith("nu") else "m" for a in labels}}
-        folder = Path(output.folder)
         self._tables = [
             CsvWriter(folder / f"probe-{m}.csv", columns, self.comm, resume) for m in self.names
         ]

@@ -60,7 +60,7 @@ from complexbody.errors import SceneError
 from complexbody.forms import scaled_icosahedral_quasicrystal
 from complexbody.meshes import Side, altitudes, balanced, notched_plate
 from complexbody.picture import Panel, still
-from complexbody.simulate import Simulation
+from complexbody.simulation import Simulation
 
 LENGTH, WIDTH, NOTCH, OPENING, THICKNESS = 2.4, 1.0, 0.9, 0.02, 0.05
 

@@ -16,7 +16,7 @@ import complexbody as cb
 from complexbody import meshes
 from complexbody.errors import ComplexBodyError
 from complexbody.problem import Problem
-from complexbody.simulate import Simulation
+from complexbody.simulation import Simulation
 
 
 def energy(U, nu, N):

@@ -11,7 +11,7 @@ from dense import prepared
 import complexbody as cb
 from complexbody import meshes
 from complexbody.forms import scaled_icosahedral_quasicrystal
-from complexbody.simulate import Simulation
+from complexbody.simulation import Simulation
 
 pytestmark = [pytest.mark.slow, pytest.mark.serial]
 

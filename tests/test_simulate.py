@@ -21,7 +21,7 @@ from complexbody import _compat, meshes
 from complexbody.errors import IntegratorError, OutputError, SceneError, StepError
 from complexbody.forms import isotropic_two_field
 from complexbody.halo import Halo
-from complexbody.simulate import hermite
+from complexbody.stepping import hermite
 
 STIFF, OWN, CELLS = 1.0, 0.4, 10
 SIDES = (cb.Fix("u", "boundary"), cb.Fix("nu", "boundary"))
