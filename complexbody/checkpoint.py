@@ -20,15 +20,19 @@ import numpy.typing as npt
 
 from complexbody import statefile
 from complexbody.errors import CheckpointError
+from complexbody.given import is_path, is_positive, is_whole, short
 from complexbody.identity import CLOSE, difference, histories
 from complexbody.integrators.snapshot import Snapshot
 from complexbody.numbering import Numbering
 from complexbody.problem import Problem
+from complexbody.wellformed import flaw, misfit
 
 Array = npt.NDArray[Any]
 
 #: Where checkpoints are, in the folder of a run.
 FOLDER = "checkpoints"
+#: What to do with one that is whole and yet none of ours.
+FOREIGN = "Use a checkpoint that complexbody made of this run, or begin anew."
 
 
 @dataclass(frozen=True)
@@ -54,13 +58,19 @@ class Checkpoint:
     folder: str | Path | None = None
 
     def __post_init__(self) -> None:
-        if self.every is not None and not (np.isfinite(self.every) and self.every > 0):
-            raise CheckpointError(f"Checkpoint: every is {self.every}. Give seconds, > 0, or None.")
+        if self.every is not None and not is_positive(self.every):
+            raise CheckpointError(
+                f"Checkpoint: every is {short(self.every)}. Give seconds, > 0, or None."
+            )
         for name in ("steps", "keep"):
             value = getattr(self, name)
-            whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-            if not ((whole and value >= 1) or (value is None and name == "steps")):
-                raise CheckpointError(f"Checkpoint: {name} is {value!r}. Give a whole number ≥ 1.")
+            fits = is_whole(value) and value >= 1
+            if not fits and not (value is None and name == "steps"):
+                raise CheckpointError(
+                    f"Checkpoint: {name} is {short(value)}. Give a whole number ≥ 1."
+                )
+        if self.folder is not None and not is_path(self.folder):
+            raise CheckpointError(f"Checkpoint: folder is {short(self.folder)}. Give a path.")
 
     def place(self, output: Any) -> Path:
         """The folder of a run's checkpoints, given its Output or None.
@@ -112,7 +122,7 @@ class Found:
         if abs(step - self.about["step"]) > CLOSE * step:
             raise CheckpointError(
                 f"{self.path} was made with steps of {self.about['step']:.6g} s, and now they are "
-                f"{step:.6g} s. Resume with the version of complexbody that made it, or begin anew."
+                f"{step:.6g} s. Use the version of complexbody that made it, or begin anew."
             )
         if until < self.about["time"] - CLOSE * step:
             raise CheckpointError(
@@ -120,8 +130,23 @@ class Found:
                 f"for, {until:.6g} s. Give a later until."
             )
 
-    def snapshot(self, numbering: Numbering) -> Snapshot:
-        """This rank's share of the run's state; collective."""
+    def snapshot(self, numbering: Numbering, like: Snapshot, columns: int) -> Snapshot:
+        """This rank's share of the run's state; collective.
+
+        Args:
+            numbering: Of this rank's nodes and cells.
+            like: A snapshot of the run as it begins.
+            columns: Of its ledger.
+
+        Raises:
+            CheckpointError: for a state that is none of such a run.
+        """
+        why, rows = "", numbering.rows()
+        if self.arrays is not None:
+            why = misfit(self.about, self.arrays, like, rows, columns)
+        why = numbering.comm.bcast(why)
+        if why:
+            raise CheckpointError(f"{self.path} has {why}. {FOREIGN}")
         # Sums belong to ranks as long as these have the same cells.
         same = self.same = numbering.layout == self.about["layout"]
 
@@ -171,6 +196,9 @@ def find(
         if comm.rank == 0:
             try:
                 found = Found(path, *statefile.read(path))
+                lacks = flaw(found.about)
+                if lacks:
+                    found, why = None, f"{path} has {lacks}. {FOREIGN}"
             except CheckpointError as error:
                 why = str(error)
         why = comm.bcast(why)

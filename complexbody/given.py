@@ -8,6 +8,7 @@ not. Knows nothing else of complexbody.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,11 @@ def is_whole(value: Any) -> bool:
 def is_flag(value: Any) -> bool:
     """Whether this is True or False."""
     return isinstance(value, bool | np.bool_)
+
+
+def is_path(value: Any) -> bool:
+    """Whether this can be the name of a file or folder."""
+    return isinstance(value, str | Path) and str(value) != "" and "\0" not in str(value)
 
 
 def numbers(value: Any) -> npt.NDArray[np.float64] | None:

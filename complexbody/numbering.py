@@ -79,6 +79,11 @@ class Numbering:
 
     # --- rows to rank 0, and back ----------------------------------------------------------------
 
+    def rows(self) -> dict[str, int]:
+        """Rows of arrays of nodes, cells and cells' corners, on rank 0; zeros elsewhere."""
+        nodes, cells = (0 if order is None else len(order) for order in self._order)
+        return {"nodes": nodes, "cells": cells, "corners": cells}
+
     def gather_nodes(self, values: Array) -> Array | None:
         """Rows of nodes (nodes, …) in the order of the input on rank 0, else None; collective."""
         found = _collect(self.comm, values[self._counted])

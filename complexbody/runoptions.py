@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from complexbody.errors import IntegratorError, SceneError
-from complexbody.given import is_flag, is_positive, is_whole, short
+from complexbody.checkpoint import Checkpoint
+from complexbody.errors import CheckpointError, IntegratorError, SceneError
+from complexbody.given import is_flag, is_path, is_positive, is_whole, short
 from complexbody.integrators.asynchronous import AVI
 from complexbody.integrators.implicit import Implicit
 from complexbody.integrators.local_leapfrog import LocalLeapfrog
@@ -28,12 +29,15 @@ def check_options(
     output: Any = None,
     ledger_steps: Any = None,
     growth: Any = None,
+    checkpoint: Any = None,
+    resume: Any = False,
     **flags: Any,
 ) -> None:
     """Refuse options of :func:`simulate` that make no sense.
 
     Raises:
         SceneError: for the first of them.
+        CheckpointError: for what is no checkpoint's.
     """
     if not is_positive(until):
         raise SceneError(
@@ -47,6 +51,14 @@ def check_options(
         )
     if growth is not None and not is_positive(growth):
         raise SceneError(f"simulate: growth is {short(growth)}. Give a number > 0, or None.")
+    if checkpoint is not None and not isinstance(checkpoint, Checkpoint):
+        raise CheckpointError(
+            f"simulate: checkpoint is {short(checkpoint)}. Give cb.Checkpoint(…), or None."
+        )
+    if not is_flag(resume) and not is_path(resume):
+        raise CheckpointError(
+            f"simulate: resume is {short(resume)}. Give True, a run's folder, or a checkpoint."
+        )
     for name, value in flags.items():
         if name in FLAGS and not (is_flag(value) or (value is None and name != "plan")):
             raise SceneError(f"simulate: {name} is {short(value)}. Give True or False.")

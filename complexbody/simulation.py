@@ -19,8 +19,14 @@ from mpi4py import MPI
 
 from complexbody import machine, planning
 from complexbody.amplitudes import try_histories
-from complexbody.checkpoint import FOLDER, Checkpoint, Found, described, find
-from complexbody.errors import ComplexBodyError, DivergenceError, SolverError, agree
+from complexbody.checkpoint import FOLDER, FOREIGN, Checkpoint, Found, described, find
+from complexbody.errors import (
+    CheckpointError,
+    ComplexBodyError,
+    DivergenceError,
+    SolverError,
+    agree,
+)
 from complexbody.identity import identity
 from complexbody.instabilities import warn_of
 from complexbody.integrators.entries import Run
@@ -85,7 +91,7 @@ class Simulation:
         begun = clock.perf_counter()
         check_options(
             until=until, output=output, ledger_steps=ledger_steps, growth=growth,
-            progress=progress, plan=plan, quiet=quiet,
+            progress=progress, plan=plan, quiet=quiet, checkpoint=checkpoint, resume=resume,
         )  # fmt: skip
         self.method = chosen(integrator)
         self.watch = watch
@@ -127,12 +133,12 @@ class Simulation:
         self.begun_for = until if found is None else float(found.about["until"])
         self.run_: Run = self.method.prepare(self.problem, self.begun_for)
         self.problem.release()
+        self.books = Bookkeeper(self.problem, self.run_, growth)
         if found is not None:
             found.require(self.run_.step, until)
-            self.run_.restore(found.snapshot(Numbering(self.problem.disc)))
+            self._restore(self.run_, found)
         self.plan = planning.of_run(self.problem, self.method) if plan else None
         self.last = steps_until(until, self.run_.step)
-        self.books = Bookkeeper(self.problem, self.run_, growth)
         self.files = Outfiles(self.problem, output)
         self.times = self.files.times(until)
         self.keeper: Keeper | None = None
@@ -176,6 +182,15 @@ class Simulation:
             "noted": self._noted == self.run_.steps, "statistics": asdict(self.stats),
         }  # fmt: skip
         return about, {"ledger": lambda: np.array(self.books.ledger.rows[:rows])}
+
+    def _restore(self, run: Any, found: Found) -> None:
+        """Bring the run to a checkpoint; collective."""
+        columns = len(self.books.ledger.columns)
+        state = found.snapshot(Numbering(self.problem.disc), run.snapshot(), columns)
+        try:
+            run.restore(state)
+        except (KeyError, TypeError, ValueError) as error:  # the same on all ranks, as names are
+            raise CheckpointError(f"{found.path} lacks {error}. {FOREIGN}") from error
 
     def _resume(self, found: Found) -> None:
         """Go on from a checkpoint; collective."""

@@ -101,11 +101,15 @@ def read(path: Path) -> tuple[dict[str, Any], Mapping[str, Array]]:
         raise CheckpointError(f"{path} cannot be read ({error}). Use an older one.") from error
     if not whole:
         raise CheckpointError(f"{path} is damaged: its checksum is wrong. Use an older one.")
-    with zipfile.ZipFile(path) as archive:
-        about = json.loads(archive.read(_ABOUT))
-    if about["format"] != FORMAT:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            about = json.loads(archive.read(_ABOUT))
+        made = about["format"]
+    except (zipfile.BadZipFile, OSError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path} is no checkpoint ({error!r}). Use another one.") from error
+    if made != FORMAT:
         raise CheckpointError(
-            f"{path} has format {about['format']}, and this version reads {FORMAT}. Use the "
+            f"{path} has format {made}, and this version reads {FORMAT}. Use the "
             f"version that wrote it ({about.get('versions', {}).get('complexbody', 'unknown')})."
         )
     return about, Arrays(path)
