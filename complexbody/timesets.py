@@ -219,7 +219,7 @@ def cell_steps(problem: Problem, scheme: str = "exact") -> Array:
 
 
 def _cell_steps(problem: Problem, scheme: str) -> Array:
-    """The same of a problem with all components, computed; collective."""
+    """The same of a problem's own components, computed; collective."""
     disc = problem.disc
     rho = cell_densities(problem)
     out = np.full((disc.blocks, disc.lanes), np.inf)
@@ -279,13 +279,19 @@ def _shared_mass(problem: Problem, h: float, scheme: str) -> float:
     return float(problem.comm.allreduce(float(ratios.min(initial=1.0)), op=MPI.MIN))
 
 
-def critical_step(problem: Problem, scheme: str = "exact", how: str = "cells") -> float:
+def critical_step(
+    problem: Problem, scheme: str = "exact", how: str = "cells", given: float | None = None
+) -> float:
     """Largest stable synchronous step [s]: the cells' bound, or the body's own by SLEPc.
+
+    It is that of all components, so that a plan that leaves some out changes no step, unless a
+    step is given that only those left allow: what is zero and stays so cannot grow.
 
     Args:
         problem: The scene, made ready.
         scheme: Dissipation scheme.
         how: "cells" or "global".
+        given: A step that is asked for [s].
 
     Returns:
         The step, the same on all ranks.
@@ -293,8 +299,10 @@ def critical_step(problem: Problem, scheme: str = "exact", how: str = "cells") -
     Raises:
         StepError: if nothing limits the step (a body without stiffness).
     """
-    local = float(np.min(cell_steps(problem, scheme), initial=np.inf))
-    step = float(problem.comm.allreduce(local, op=MPI.MIN))
+    whole, each = problem.full, cell_steps(problem, scheme)
+    step = _least(problem, each)
+    if given is not None and whole is not problem and given > step * (1 + 1e-9):
+        whole, step = problem, _least(problem, _cell_steps(problem, scheme))
     if not np.isfinite(step) or step <= 0:
         raise StepError(
             "No finite critical step: the body has no stiffness. Give an energy, or a step."
@@ -302,8 +310,12 @@ def critical_step(problem: Problem, scheme: str = "exact", how: str = "cells") -
     if how == "global":
         from complexbody.spectrum import global_step
 
-        step = global_step(problem.full, scheme, step)
+        step = global_step(whole, scheme, step)
     return step
+
+
+def _least(problem: Problem, steps: Array) -> float:
+    return float(problem.comm.allreduce(float(np.min(steps, initial=np.inf)), op=MPI.MIN))
 
 
 def require_constant_inertia(problem: Problem, integrator: str) -> None:

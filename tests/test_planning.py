@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 import ufl
-from harness import everywhere, largest
+from harness import everywhere, largest, refused
 
 import complexbody as cb
 from complexbody import meshes
 from complexbody.cli import main
+from complexbody.errors import StepError
 from complexbody.problem import Problem
 from complexbody.waves import dispersion, wave_matrix
 
@@ -127,6 +128,32 @@ def test_what_a_run_says(comm, shared_path):
     assert made.components == ("u1",) and made.left_out == ("u2", "nu1", "nu2")
     assert "u1 by initial data" in str(made)
     assert cb.simulate(scene, until=0.1, plan=False).plan is None
+
+
+def test_a_step_that_those_left_allow(comm):
+    """What stays zero limits no step that is given; without a plan it does."""
+
+    def scene(stiff):
+        def energy(U, nu, N):
+            return 0.5 * stiff * ufl.inner(U, U) + 0.5 * ufl.inner(N, N)
+
+        mesh = meshes.rectangle(comm, (0, 0), (1, 1), (6, 5))
+        start = cb.Initial(nu=lambda x: np.cos(np.pi * x[0]))
+        return cb.Scene(mesh, cb.Body(1, energy, 1.0, 1.0, displacement=2), initial=start)
+
+    stiff, until = scene(100.0), 0.5
+    step = 0.9 * cb.simulate(scene(1.0), until=until, plan=False).stats.critical
+    (text,) = [s for s in cb.plan(stiff, until).suggestions if "Those left" in s]
+    assert "10 times as long" in text
+    assert cb.simulate(stiff, until=until).stats.critical < 0.12 * step
+    found = cb.simulate(stiff, cb.Synchronous(step), until=until)
+    other = cb.simulate(scene(1.0), cb.Synchronous(step), until=until, plan=False)
+    assert found.stats.critical == pytest.approx(step / 0.9, rel=1e-9)
+    assert largest(comm, found.nu.x.array - other.nu.x.array) < 1e-14
+    with refused(StepError, "critical step"):
+        cb.simulate(stiff, cb.Synchronous(step), until=until, plan=False)
+    with refused(StepError, "critical step"):
+        cb.simulate(stiff, cb.Synchronous(1.2 * step), until=until)
 
 
 @pytest.mark.serial

@@ -20,7 +20,7 @@ from complexbody.dampers import refuse_dampers
 from complexbody.errors import IntegratorError, StepError
 from complexbody.given import is_whole
 from complexbody.integrators.implicit_run import ImplicitRun
-from complexbody.integrators.options import flags, one_of, petsc_options, positive
+from complexbody.integrators.options import chosen_step, flags, one_of, petsc_options, positive
 from complexbody.integrators.split_run import SplitRun
 from complexbody.integrators.synchronous import Synchronous
 from complexbody.integrators.synchronous_run import SynchronousRun
@@ -155,21 +155,12 @@ class Implicit:
         require_constant_inertia(problem, "Implicit(forces='implicit')")
         refuse_dampers(problem, "Implicit(forces='implicit')")
         critical = self._critical(problem, HELD)
-        step = self.step
-        if step is None:
-            step = min(self.safety * critical, until)
-            step = until / np.ceil(until / step * (1 - 1e-12))
-        if step > critical * (1 + 1e-9) and not self.unstable_ok:
-            raise StepError(
-                f"The step {step:.6g} s is larger than the critical step of u, {critical:.6g} s, "
-                "which stays explicit. Give a smaller step, or unstable_ok=True to see what "
-                "happens."
-            )
-        return SplitRun(problem, self, float(step), float(critical))
+        step = chosen_step(self, critical, until, "critical step of u, which stays explicit,")
+        return SplitRun(problem, self, step, critical)
 
     def _critical(self, problem: Problem, scheme: str) -> float:
         try:
-            return critical_step(problem, scheme)
+            return critical_step(problem, scheme, given=self.step)
         except StepError:
             # A body without stiffness has no critical step; one that the user gives will do.
             if self.step is None:

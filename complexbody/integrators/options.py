@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from complexbody.errors import IntegratorError, StepError
 from complexbody.given import is_flag, is_positive, is_whole, short
 
@@ -37,6 +39,36 @@ def one_of(method: Any, name: str, allowed: tuple[Any, ...]) -> None:
             f"{type(method).__name__}: {name}={short(value)} is not known. Give one of "
             f"{', '.join(map(str, allowed))}."
         )
+
+
+def divided(step: float, until: float) -> float:
+    """The step, shortened so that the end of the run falls on one [s]."""
+    return float(until / np.ceil(until / min(step, until) * (1 - 1e-12)))
+
+
+def chosen_step(
+    method: Any, critical: float, until: float, which: str = "critical step", divide: bool = False
+) -> float:
+    """The step of an explicit integrator [s]: its own, or its safety times the critical one.
+
+    Args:
+        method: The integrator.
+        critical: The critical step [s].
+        until: End of the run, which falls on a step if the integrator has none of its own [s].
+        which: What is critical, in words.
+        divide: The end falls on a step in any case.
+
+    Raises:
+        StepError: if it is above the critical one and ``unstable_ok`` is False.
+    """
+    step = method.safety * critical if method.step is None else float(method.step)
+    step = divided(step, until) if divide or method.step is None else step
+    if step > critical * (1 + 1e-9) and not method.unstable_ok:
+        raise StepError(
+            f"The step {step:.6g} s is larger than the {which} {critical:.6g} s, so the run would "
+            "be unstable. Give a smaller step, or unstable_ok=True to see it happen."
+        )
+    return step
 
 
 def flags(method: Any, *names: str) -> None:

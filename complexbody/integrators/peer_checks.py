@@ -10,6 +10,7 @@ import scipy.linalg
 from mpi4py import MPI
 
 from complexbody.errors import IntegratorError, StepError
+from complexbody.integrators.options import divided
 from complexbody.periodicity import require_unrepeated
 from complexbody.problem import Problem
 from complexbody.stiffness import require_explicit_self_action
@@ -66,26 +67,6 @@ def given_step(method: Any, until: float) -> float:
             "step= in seconds."
         )
     return divided(method.step, until)
-
-
-def divided(step: float, until: float) -> float:
-    """The step, shortened so that the end of the run falls on one."""
-    return float(until / np.ceil(until / min(step, until) * (1 - 1e-12)))
-
-
-def explicit_step(method: Any, critical: float, until: float) -> float:
-    """The step of an explicit integrator.
-
-    Raises:
-        StepError: if it is above the critical one and ``unstable_ok`` is False.
-    """
-    step = divided(method.safety * critical if method.step is None else method.step, until)
-    if step > critical * (1 + 1e-9) and not method.unstable_ok:
-        raise StepError(
-            f"The step {step:.6g} s is larger than the critical step {critical:.6g} s, so the "
-            "run would be unstable. Give a smaller step, or unstable_ok=True to see it happen."
-        )
-    return step
 
 
 def limit_rk4(problem: Problem) -> float:

@@ -17,9 +17,8 @@ from complexbody.errors import IntegratorError
 from complexbody.given import is_finite, short
 from complexbody.integrators.assembled import AssembledRun
 from complexbody.integrators.newmark import NewmarkRun
-from complexbody.integrators.options import flags, one_of, petsc_options, positive
+from complexbody.integrators.options import chosen_step, flags, one_of, petsc_options, positive
 from complexbody.integrators.peer_checks import (
-    explicit_step,
     given_step,
     limit_rk4,
     require,
@@ -85,8 +84,8 @@ class AssembledLeapfrog:
                 "AssembledLeapfrog: force='matrix' needs energies with a constant Hessian, and one "
                 "of these is not. Use force='assembly'."
             )
-        critical = critical_step(problem, self.dissipation)
-        step = explicit_step(self, critical, until)
+        critical = critical_step(problem, self.dissipation, given=self.step)
+        step = chosen_step(self, critical, until, divide=True)
         return AssembledRun(problem, self, step, critical)
 
 
@@ -228,4 +227,4 @@ class PetscTS:
         if not self.explicit:
             return PetscRun(problem, self, given_step(self, until), float("inf"))
         critical = limit_rk4(problem)
-        return PetscRun(problem, self, explicit_step(self, critical, until), critical)
+        return PetscRun(problem, self, chosen_step(self, critical, until, divide=True), critical)

@@ -10,10 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
-
-from complexbody.errors import StepError
-from complexbody.integrators.options import flags, one_of, positive
+from complexbody.integrators.options import chosen_step, flags, one_of, positive
 from complexbody.integrators.synchronous_run import SynchronousRun
 from complexbody.masses import SCHEMES
 from complexbody.problem import Problem
@@ -75,17 +72,9 @@ class Synchronous:
         require_constant_inertia(problem, "Synchronous")
         if self.critical == "global":
             require_explicit_self_action(problem.scene, "critical='global'")
-        critical = critical_step(problem, self.dissipation, self.critical)
-        step = self.step
-        if step is None:
-            step = min(self.safety * critical, until)
-            step = until / np.ceil(until / step * (1 - 1e-12))
-        if step > critical * (1 + 1e-9) and not self.unstable_ok:
-            raise StepError(
-                f"The step {step:.6g} s is larger than the critical step {critical:.6g} s, so the "
-                "run would be unstable. Give a smaller step, or unstable_ok=True to see it happen."
-            )
-        problem.stiffen(float(step))
-        run = SynchronousRun(problem, self, float(step), float(critical))
+        critical = critical_step(problem, self.dissipation, self.critical, self.step)
+        step = chosen_step(self, critical, until)
+        problem.stiffen(step)
+        run = SynchronousRun(problem, self, step, critical)
         run.watch()
         return run
