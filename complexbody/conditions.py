@@ -40,6 +40,7 @@ class Absorb:
     Viscous dampers on the facets, t = −Z(n)q̇ with q = (u, ν): Z(n) is the impedance matrix of the
     body's own plane waves along the normal n (:mod:`complexbody.impedance`). It couples all
     components, so that P, S and ν waves, and waves in which u and ν go together, are all matched.
+    Of an energy that is not quadratic, small waves about the initial state are matched.
     The dampers are lumped at the facets' vertices; the power they take is in the ledger's
     ``dissipated``.
 

@@ -15,10 +15,11 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody import _compat
+from complexbody import _compat, hessian
 from complexbody.boundary import entities
 from complexbody.errors import IntegratorError, SceneError, agree
 from complexbody.facets import exterior
+from complexbody.hessian import NotQuadratic
 from complexbody.impedance import impedance
 
 if TYPE_CHECKING:
@@ -136,6 +137,10 @@ class _Materials:
         block, lane = np.nonzero(disc.source_cell >= 0)
         self.place[disc.source_cell[block, lane]] = np.stack([block, lane], axis=1)
         self.known: dict[tuple[object, ...], Array] = {}
+        self._cells = _compat.cell_nodes(scene.mesh)
+        self._fields = problem.start[0].copy()
+        rows, columns = np.nonzero(problem.supports.fixed)
+        self._fields[rows, columns] = problem.supports.targets(rows, columns, 0.0)
 
     def impedances(
         self, cells: Ints, normals: Array, frequency: float | None, field: str | None
@@ -143,7 +148,7 @@ class _Materials:
         """Z of facets by their cells and normals, shape (facets, n, n).
 
         Raises:
-            SceneError: for bodies whose energy is not quadratic, or without the limit asked for.
+            SceneError: for bodies whose waves cannot be told, or without the limit asked for.
         """
         n, coefficients = self.problem.scene.components, self.problem.kernels.coefficients
         varying = bool(self.problem.kernels.densities.coefficients)
@@ -155,11 +160,27 @@ class _Materials:
             region, (block, lane) = int(self.regions[cell]), self.place[cell]
             rho, values = self._density(region, cell), coefficients[block * varying, :, lane]
             alike = tuple(np.round(normal, 14))
-            key = (region, rho, values.tobytes(), alike, frequency, field)
+            state = self._state(region, cell)
+            key = (region, rho, values.tobytes(), state.tobytes(), alike, frequency, field)
             if key not in self.known:
-                self.known[key] = kept * self._impedance(region, rho, values, normal, frequency)
+                H = self._hessian(region, values, state)
+                self.known[key] = kept * self._impedance(region, rho, H, normal, frequency)
             out[i] = self.known[key]
         return out
+
+    def _state(self, region: int, cell: int) -> Array:
+        """(u, ν) and ∇(u, ν) of a cell at the start, rounded, (4n,); empty where H is constant."""
+        densities = self.problem.kernels.densities
+        if densities.linear or densities.generated[region]:
+            return np.zeros(0)
+        nodes, dim = self._cells[cell], self.problem.disc.dim
+        x, q = np.asarray(self.problem.scene.mesh.geometry.x)[nodes, :dim], self._fields[nodes]
+        gradient = np.zeros((q.shape[1], 3))
+        gradient[:, :dim] = np.linalg.solve(x[1:] - x[0], q[1:] - q[0]).T
+        out = np.concatenate([q.mean(axis=0), gradient.ravel()])
+        # Cells that are alike but for round-off have one impedance.
+        grain = GRAIN**0.75 * max(np.abs(out).max(), 1e-300)
+        return np.asarray(np.rint(out / grain) * grain + 0.0)
 
     def _density(self, region: int, cell: int) -> float:
         rho = self.problem.scene.bodies[region].density
@@ -167,22 +188,51 @@ class _Materials:
             return float(rho)
         return float(rho.x.array[_compat.cell_dofs(rho.function_space)[cell, 0]])
 
-    def _impedance(
-        self, region: int, rho: float, values: Array, normal: Array, frequency: float | None
-    ) -> Array:
+    def _hessian(self, region: int, values: Array, state: Array) -> Array:
+        """H of ρe + ρw in a cell, (4n, 4n): of a density that is not quadratic at the start."""
         scene, d = self.problem.scene, self.problem.kernels.densities
-        n, n_u, body = scene.components, scene.displacement, scene.bodies[region]
-        if not d.generated[region]:
-            raise SceneError(
-                f"Absorb: the energy of {body.name} is not quadratic, so that its waves depend on "
-                "the state. Give that part of the body a quadratic energy, or leave it free."
-            )
+        n, body = scene.components, scene.bodies[region]
         H = np.zeros((4 * n, 4 * n))
-        for (i, j), parts in d.total(region).items():
-            H[i, j] += sum(
-                v if isinstance(v, float) else values[d.coefficients.index(v)] for v in parts
-            )
+        if d.generated[region]:
+            for (i, j), parts in d.total(region).items():
+                H[i, j] += sum(
+                    v if isinstance(v, float) else values[d.coefficients.index(v)] for v in parts
+                )
+            return H
+        n_u, k = scene.displacement, scene.descriptor
+        gradient = state[n:].reshape(n, 3) if len(state) else np.zeros((n, 3))
+        q = state[:n] if len(state) else np.zeros(n)
+        arguments = {
+            "gradients": (body.energy, (gradient[:n_u], q[n_u:], gradient[n_u:])),
+            "fields": (body.potential, (q[:n_u], q[n_u:])),
+        }
+        for what, (density, at) in arguments.items():
+            if density is None:
+                continue
+            try:
+                found = hessian.read_at(density, n_u, k, what, at)
+            except NotQuadratic:
+                raise _unknown(body.name) from None
+            if found.expressions():
+                raise _unknown(body.name)
+            for (i, j), value in found.hessian.items():
+                H[i, j] += value
+        return H
+
+    def _impedance(
+        self, region: int, rho: float, H: Array, normal: Array, frequency: float | None
+    ) -> Array:
+        scene = self.problem.scene
+        n, n_u, body = scene.components, scene.displacement, scene.bodies[region]
         M, D = np.zeros((n, n)), np.zeros((n, n))
         M[range(n_u), range(n_u)] = rho
         M[n_u:, n_u:], D[n_u:, n_u:] = body.inertia_matrix, body.viscosity_matrix
         return impedance(H, M, D, normal, frequency)
+
+
+def _unknown(name: str) -> SceneError:
+    return SceneError(
+        f"Absorb: the second derivative of the energy of {name} at the start varies within cells "
+        "or cannot be read, so that its waves are not known. Give that part of the body another "
+        "energy, or leave it free."
+    )
