@@ -54,16 +54,16 @@ HALF := $(wildcard tests/test_*.py tests/verification/test_windows*.py) tests/fo
 # On a new machine compiling takes longer than the few steps of a test: it is told to hurry.
 test: export COMPLEXBODY_OPTIMISATION := -O1
 # All are run, whichever fails: serially in two halves at once; on 2 and 3 ranks what is about ranks
-# with a sixth and a twelfth of the rest (make verify: all of it).
+# with a ninth and an eighteenth of the rest (make verify: all of it).
 test: setup ## all but the slow tests: serially, on 2 and on 3 ranks
 	@status=0; mkdir -p build/test-tmp/half; set -x; \
 	PYTEST_DEBUG_TEMPROOT=build/test-tmp/half $(PYTEST) -p no:cacheprovider --color=no \
 	    -m "not slow" $(HALF) >build/half.log 2>&1 & half=$$!; \
 	$(PYTEST) -m "not slow" $(HALF:%=--ignore=%) || status=1; \
 	wait $$half || status=1; cat build/half.log; \
-	timeout -k 10 900 $(MPIRUN) -n 2 $(MPI_PYTEST) -m "not serial and not slow" --sample 6 \
+	timeout -k 10 900 $(MPIRUN) -n 2 $(MPI_PYTEST) -m "not serial and not slow" --sample 9 \
 	    || status=1; \
-	timeout -k 10 900 $(MPIRUN) -n 3 $(MPI_PYTEST) -m "not serial and not slow" --sample 12 \
+	timeout -k 10 900 $(MPIRUN) -n 3 $(MPI_PYTEST) -m "not serial and not slow" --sample 18 \
 	    || status=1; \
 	exit $$status
 
