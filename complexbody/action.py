@@ -32,7 +32,8 @@ def _nodal(found: Any, count: int, points: int, what: str) -> Any:
     Raises:
         SceneError: for another shape: what is merely turned round would be taken otherwise.
     """
-    given = numbers(found)
+    mask = isinstance(found, np.ndarray) and found.dtype == np.bool_  # a predicate means 0 and 1
+    given = numbers(found.astype(np.int64) if mask else found)
     if given is None:  # rows of which some are single numbers
         rows = [numbers(row) for row in found] if isinstance(found, Sequence) else []
         each = [r for r in rows if r is not None and r.shape in ((), (points,))]
