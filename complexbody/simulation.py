@@ -8,8 +8,9 @@ the cubic Hermite interpolant of fields and rates, whose error is of higher orde
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,22 +18,20 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from complexbody import machine, planning
+from complexbody import planning
 from complexbody.amplitudes import try_histories
-from complexbody.checkpoint import FOLDER, FOREIGN, Checkpoint, Found, described, find
+from complexbody.checkpoint import Checkpoint
+from complexbody.continuation import Continuation
 from complexbody.errors import (
-    CheckpointError,
     ComplexBodyError,
     DivergenceError,
     SolverError,
     agree,
 )
-from complexbody.identity import identity
 from complexbody.instabilities import warn_of
 from complexbody.integrators.entries import Run
-from complexbody.keeper import Description, Keeper, clear
+from complexbody.keeper import Description
 from complexbody.ledger import Bookkeeper
-from complexbody.numbering import Numbering
 from complexbody.outfiles import Outfiles
 from complexbody.output import Output
 from complexbody.problem import Problem
@@ -120,59 +119,29 @@ class Simulation:
             try_histories(self.comm, data.histories, until)
         warn_of(self.problem, self.method, until)
         self.problem.quiet = plan if quiet is None else quiet
-        folder = checkpoint.place(output) if checkpoint is not None else None
-        known: dict[str, list[Any]] = {}
-        found: Found | None = None
-        if folder is not None or resume:
-            known = identity(self.problem, Numbering(self.problem.disc))
-        if resume:
-            place = (checkpoint or Checkpoint()).place(output) if resume is True else resume
-            found = find(place, self.problem, self.method, known)
-        self.resumed = found
-        # A run keeps the step that it began with.
-        self.begun_for = until if found is None else float(found.about["until"])
-        self.run_: Run = self.method.prepare(self.problem, self.begun_for)
+        going_on = Continuation(self.problem, self.method, output, checkpoint, resume)
+        self.resumed = going_on.found
+        self.run_: Run = self.method.prepare(self.problem, going_on.begun_for(until))
         self.problem.release()
         self.books = Bookkeeper(self.problem, self.run_, growth)
-        if found is not None:
-            found.require(self.run_.step, until)
-            self._restore(self.run_, found)
+        rows = None
+        if self.resumed is not None:
+            rows = going_on.restore(self.run_, until, len(self.books.ledger.columns))
         self.plan = planning.of_run(self.problem, self.method) if plan else None
         self.last = steps_until(until, self.run_.step)
         self.files = Outfiles(self.problem, output)
         self.times = self.files.times(until)
-        self.keeper: Keeper | None = None
-        if checkpoint is not None and folder is not None:
-            self.keeper = Keeper(
-                self.problem, self.run_, checkpoint, folder, self._about(known), self._describe,
-                self.files.sync, fresh=found is None,
-            )  # fmt: skip
-        elif output is not None and found is None:
-            clear(self.comm, Path(output.folder) / FOLDER)  # they belong to what is replaced
         # Now that nothing refuses the run: it replaces what an earlier one wrote.
-        since = None if found is None else (found.about["written"], found.about["time"])
-        self.files.open(self.books.ledger, self._steps(), since)
+        self.keeper = going_on.keeper(self.run_, until, self._describe, self.files.sync)
+        self.files.open(self.books.ledger, self._steps(), going_on.since)
         self._noted, self._before = -1, (np.zeros(0), np.zeros(0))
         self.progress = Progress(self.comm, until, progress)
         self._statistics()
         self.every = ledger_steps or default_ledger_steps(
             self.stats.cells, self.comm.size, self.last
         )
-        if found is not None:
-            self._resume(found)
-
-    # --- checkpoints ---------------------------------------------------------------------------
-
-    def _about(self, known: dict[str, list[Any]]) -> dict[str, Any]:
-        """What stays the same in all checkpoints of the run."""
-        output = None
-        if self.output is not None:
-            output = {f.name: getattr(self.output, f.name) for f in fields(self.output)}
-            output = {k: v for k, v in output.items() if k != "folder"}
-        return {
-            "identity": known, "integrator": described(self.method), "until": self.begun_for,
-            "end": self.until, "output": output, "versions": machine.versions(),
-        }  # fmt: skip
+        if self.resumed is not None and rows is not None:
+            self._resume(self.resumed.about, rows)
 
     def _describe(self) -> Description:
         """What a checkpoint keeps of the simulation around the run."""
@@ -183,20 +152,8 @@ class Simulation:
         }  # fmt: skip
         return about, {"ledger": lambda: np.array(self.books.ledger.rows[:rows])}
 
-    def _restore(self, run: Any, found: Found) -> None:
-        """Bring the run to a checkpoint; collective."""
-        columns = len(self.books.ledger.columns)
-        state = found.snapshot(Numbering(self.problem.disc), run.snapshot(), columns)
-        try:
-            run.restore(state)
-        except (KeyError, TypeError, ValueError) as error:  # the same on all ranks, as names are
-            raise CheckpointError(f"{found.path} lacks {error}. {FOREIGN}") from error
-
-    def _resume(self, found: Found) -> None:
-        """Go on from a checkpoint; collective."""
-        about = found.about
-        rows = None if found.arrays is None else found.arrays["ledger"]
-        rows = np.asarray(self.comm.bcast(rows)).reshape(-1, len(self.books.ledger.columns))
+    def _resume(self, about: Mapping[str, Any], rows: Array) -> None:
+        """Take from a checkpoint what was around its run."""
         self.books.restore(about["books"], rows)
         self.every = int(about["every"])
         self._noted = self.run_.steps if about["noted"] else -1
