@@ -31,8 +31,8 @@ METHODS = ("synchronous", "avi", "avi-windows", "local-leapfrog")
 CASES: dict[str, list[tuple[dict[str, Any], tuple[float, ...]]]] = {
     "bar": [({"cells": 100}, (1e-2, 3e-3)), ({"cells": 400}, (1e-2, 1e-3))],
     "phason": [({"cells": 40}, (2e-2, 1e-2)), ({"cells": 80}, (1e-2, 3e-3))],
-    "notch": [({"refine": 0.5}, (2e-1,)), ({"refine": 1.0}, (1e-1, 5e-2, 1e-2))],
-    "plate": [({"refine": 0.3}, (4e-1, 1e-1))],
+    "notch": [({"refine": 0.5}, (5e-2, 3e-2)), ({"refine": 0.8}, (2e-2, 1e-2, 3e-3))],
+    "plate": [({"refine": 0.3}, (1e-1, 5e-2)), ({"refine": 0.6}, (2e-2,))],
 }
 
 
