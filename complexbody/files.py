@@ -56,10 +56,11 @@ def replace(path: Path, content: bytes | memoryview) -> None:
     """
     draft = path.with_name(path.name + ".part")
     try:
-        with draft.open("wb", buffering=0) as file:
-            view = memoryview(content)
-            while len(view):
-                view = view[file.write(view) :]
+        with draft.open("wb", buffering=0) as file, memoryview(content) as view:
+            written = 0
+            while written < len(view):
+                with view[written:] as rest:  # released, or an error would keep the content
+                    written += file.write(rest)
         draft.replace(path)
     except OSError:
         draft.unlink(missing_ok=True)

@@ -133,7 +133,7 @@ class Series:
             both = ("topology", "geometry")
             parts = {part: self._item(file[f"Mesh/mesh/{part}"]) for part in both}
         if resume is None or not self._open.exists():
-            replace(self._open, self._content.getbuffer())
+            self._put()
         return parts
 
     def _kept(self, resume: float) -> list[Path]:
@@ -157,7 +157,7 @@ class Series:
             elif late:
                 # The index of before names steps that are gone, if only until it is replaced.
                 self._save()
-                replace(path, self._content.getbuffer())
+                self._put()
         return stale
 
     def append(self, time: float, values: Array) -> None:
@@ -181,13 +181,18 @@ class Series:
                 data.attrs["time"] = time
                 self._enter(data)
             self._count += 1
-            replace(self._open, self._content.getbuffer())
+            self._put()
             self._save()
         except BaseException:
             self._open, self._content, self._count, self._sealed = before
             del self._steps[entered[0] :]
             self._last = entered[1]
             raise
+
+    def _put(self) -> None:
+        """The content as the open file, by its name at once."""
+        with self._content.getbuffer() as view:  # released, or an error would keep it
+            replace(self._open, view)
 
     def sync(self) -> None:
         """See that all steps are on the disk, in files that are never written again.

@@ -343,10 +343,10 @@ def test_integrator_options(options, kind, words):
 def test_step_above_the_critical_one(mesh):
     """Both steps are told; whoever insists sees the run stopped."""
     scene = cb.Scene(mesh, BODY, initial=cb.Initial(u=lambda x: np.sin(20 * x)))
-    stats = cb.simulate(scene, until=0.1).stats
+    stats = cb.simulate(scene, until=0.1, plan=False).stats
     large = 3 * stats.critical  # the cells' bound is cautious
     with refused(StepError, f"{large:.6g}", f"{stats.critical:.6g}", "unstable_ok=True"):
-        cb.simulate(scene, cb.Synchronous(step=large), until=1.0)
+        cb.simulate(scene, cb.Synchronous(step=large), until=1.0, plan=False)
     insisting = cb.Synchronous(step=large, unstable_ok=True)
     with refused(DivergenceError, "critical", "smaller"):
         cb.simulate(scene, insisting, until=400 * large)
