@@ -9,11 +9,24 @@ from typing import Any
 
 import ufl
 from ufl.algorithms.analysis import extract_arguments
-from ufl.classes import Condition, ScalarValue
+from ufl.classes import (
+    Condition,
+    Constant,
+    Curl,
+    Div,
+    FormArgument,
+    Grad,
+    NablaDiv,
+    NablaGrad,
+    ScalarValue,
+)
 from ufl.corealg.traversal import unique_pre_traversal
 
 from complexbody.errors import BodyError
 from complexbody.given import short
+
+#: Derivatives in space.
+GRADIENTS = (Grad, Div, NablaGrad, NablaDiv, Curl)
 
 
 def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
@@ -42,10 +55,22 @@ def scalar(what: str, function: Callable[..., Any], *arguments: Any) -> Any:
             f"The {what} is no number: {short(value)}. Return a scalar expression of its "
             "arguments, for instance with ufl.conditional."
         )
+    given = {part for a in arguments if a is not None for part in unique_pre_traversal(a)}
     for part in unique_pre_traversal(value):
         if isinstance(part, ScalarValue) and not _is_finite(part):
             raise BodyError(f"The {what} has the constant {short(part)}. Give finite real numbers.")
+        if isinstance(part, GRADIENTS) and part not in given and _has_field(part, given):
+            raise BodyError(
+                f"The {what} takes {type(part).__name__.lower()} of its arguments. Use U for ∇u "
+                "and N for ∇ν, of three columns: gradients have no other place in it."
+            )
     return value
+
+
+def _has_field(expression: Any, fields: set[Any]) -> bool:
+    """Whether a field or constant among ``fields`` stands in an expression."""
+    inside = unique_pre_traversal(expression)
+    return any(isinstance(part, FormArgument | Constant) and part in fields for part in inside)
 
 
 def deformation(U: Any) -> Any:

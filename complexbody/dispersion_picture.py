@@ -21,6 +21,10 @@ Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[np.complex128]
 #: Frequencies below this share of the largest are zero, and speeds of theirs not drawn.
 STILL = 1e-9
+#: Decay below this share of the largest frequency is round-off.
+ROUND_OFF = 1e-12
+#: Part of the first step in which branches are told apart.
+NEAR = 1e-3
 
 
 def branches(body: Body, direction: Any, q: Array, **state: Any) -> Complex:
@@ -48,16 +52,23 @@ def branches(body: Body, direction: Any, q: Array, **state: Any) -> Complex:
             "plot_dispersion: q is no increasing array of two or more finite numbers. Give for "
             "instance numpy.linspace(0, 100, 200), in 1/m."
         )
-    omega = body.dispersion(q[:, None] * along / np.linalg.norm(along), **state)
+    along = along / np.linalg.norm(along)
+    omega = body.dispersion(q[:, None] * along, **state)
+    # Straight on, so that branches cross; at the start by slopes over a small part of a step.
+    little = NEAR * (q[1] - q[0])
+    next_to = body.dispersion((q[0] + little) * along, **state)
+    omega[0] = _matched(next_to, omega[0])
+    slope = (next_to - omega[0]) / little
     for row in range(1, len(q)):
-        before, guess = omega[row - 1], omega[row - 1]
-        if row > 1:  # straight on, so that branches cross
-            guess = before + (before - omega[row - 2]) * (
-                (q[row] - q[row - 1]) / (q[row - 1] - q[row - 2])
-            )
-        _, order = linear_sum_assignment(np.abs(guess[:, None] - omega[row]))
-        omega[row] = omega[row, order]
+        step = q[row] - q[row - 1]
+        omega[row] = _matched(omega[row - 1] + step * slope, omega[row])
+        slope = (omega[row] - omega[row - 1]) / step
     return omega
+
+
+def _matched(guess: Complex, found: Complex) -> Complex:
+    """Values in the order in which they are nearest to those guessed."""
+    return np.asarray(found[linear_sum_assignment(np.abs(guess[:, None] - found))[1]])
 
 
 def plot_dispersion(
@@ -115,7 +126,12 @@ def _draw(axes: Any, q: Array, omega: Complex) -> None:
     with np.errstate(divide="ignore", invalid="ignore"):
         speed = np.where(moving & (q[:, None] > 0), omega.real / q[:, None], np.nan)
     colours = [matplotlib.colormaps["tab10"](i) for i in range(10)]
-    seen = np.nanmax(decay, initial=0.0) > 1e-12 * size
+    seen = np.nanmax(decay, initial=0.0) > ROUND_OFF * size
+    rates = decay[-1][decay[-1] > ROUND_OFF * size]
+    apart = seen and decay.min() >= -ROUND_OFF * size and len(rates) > 0
+    log = apart and rates.max() > 1e3 * rates.min()
+    if log:  # nothing to be seen of waves that do not decay
+        decay = np.where(decay > ROUND_OFF * size, decay, np.nan)
     # Of a pair ±Re ω one is drawn, where it moves; decay, which may split it in two, of both.
     last = omega[-1]
     forward = np.flatnonzero(last.real >= -STILL * size)
@@ -142,10 +158,8 @@ def _draw(axes: Any, q: Array, omega: Complex) -> None:
     if not seen:
         axes[1].text(0.5, 0.5, "no wave decays", ha="center", transform=axes[1].transAxes)
         axes[1].set_yticks([])
-    elif (decay > 1e-12 * size).any() and decay.min() >= -1e-12 * size:
-        rates = decay[-1][decay[-1] > 1e-12 * size]
-        if len(rates) and rates.max() > 1e3 * rates.min():
-            axes[1].set_yscale("log")
+    elif log:
+        axes[1].set_yscale("log")
     fast = np.nanpercentile(speed, 90) if np.isfinite(speed).any() else np.nan
     end = np.nanmax(speed[-1]) if np.isfinite(speed[-1]).any() else np.nan
     top = np.nanmax([fast, end, -np.inf])

@@ -29,6 +29,8 @@ from complexbody.problem import Problem
 
 Array = npt.NDArray[np.float64]
 
+#: Share of the energy from which a cell is worth naming.
+TELLING = 0.01
 #: Columns and their units; momentum columns follow by component of u.
 COLUMNS = {
     "time": "s", "kinetic_u": "J", "kinetic_nu": "J", "stored": "J", "potential": "J",
@@ -155,18 +157,21 @@ class Bookkeeper:
                 began = f", largest in {place}" if place else ""
             self._stop(
                 f"Values became non-finite by t = {run.time:.6g} s (step {run.steps}){began}. The "
-                f"step {run.step:.3g} s is {run.step / run.critical:.3g} of the critical one: use "
-                "a smaller one, or check initial data, loads and the energy there.",
+                f"step {run.step:.3g} s is {run.step / run.critical:.3g} of the critical one"
+                f"{self._of_start()}: use a smaller one, or check initial data, loads and the "
+                "energy there.",
                 place,
             )
         if self.growth is not None and abs(excess) > self.growth * self._bound():
             place = guards.fullest_cell(problem, run.positions())
-            most = f"; {place.value:.0%} of the energy is in {place}" if place else ""
+            most = ""
+            if place is not None and place.value >= TELLING:
+                most = f"; {place.value:.0%} of the energy is in {place}"
             self._stop(
                 f"Energy appeared from nowhere by t = {run.time:.6g} s (step {run.steps}): "
                 f"{excess:.3g} J, more than {self.growth:g} times what was put in{most}. The step "
-                f"is {run.step / run.critical:.3g} of the critical one: use a smaller one, or let "
-                "it go on with growth=None.",
+                f"is {run.step / run.critical:.3g} of the critical one{self._of_start()}: use a "
+                "smaller one, or let it go on with growth=None.",
                 place,
             )
         place = self._orientation.worst(run.positions())
@@ -179,6 +184,15 @@ class Bookkeeper:
                 place,
             )
         self.last_good = run.time
+
+    def _of_start(self) -> str:
+        """What to know of the critical step of a body whose stiffness changes, or ""."""
+        if self.problem.kernels.densities.linear:
+            return ""
+        return (
+            " of the initial state, from which this body has changed (a ν that has become stiff is "
+            "taken by Implicit(forces='implicit'))"
+        )
 
     def _stop(self, message: str, place: guards.Place | None) -> NoReturn:
         good = self.last_good

@@ -17,6 +17,7 @@ import traceback
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -180,7 +181,8 @@ class SceneFile:
                 f"{self.path}: scene() made its mesh on {made.mesh.comm.size} of {comm.size} "
                 "ranks. Make it with the comm it is given."
             )
-        return made
+        # A scene that has no name of its own has the file's.
+        return made if made.name != Scene.name else replace(made, name=self.path.stem)
 
     @property
     def source(self) -> bytes:

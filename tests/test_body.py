@@ -109,6 +109,8 @@ def test_no_constant_matrix():
     "change, words",
     [
         ({"energy": lambda U, nu, N: U}, ("energy of gum", "(3, 3)")),
+        ({"energy": lambda U, nu, N: ufl.inner(U, U) + ufl.div(nu) ** 2}, ("div", "N for ∇ν")),
+        ({"energy": lambda U, nu, N: ufl.inner(ufl.grad(nu), ufl.grad(nu))}, ("grad", "N for ∇ν")),
         ({"energy": lambda U, nu, N: nu[ufl.i] * 2.0}, ("energy of gum", "free indices")),
         ({"energy": lambda U, nu, N: nu[2] ** 2}, ("energy of gum", "nu of shape (k,)")),
         ({"energy": lambda U, nu, N: None}, ("energy of gum",)),

@@ -312,6 +312,14 @@ def test_coefficients_that_vary(comm):
             varying.dispersion(1.0)
 
 
+def squares(U, nu, N):
+    """Shear of u coupled to two components of ν; antiplane waves have no loss."""
+    strain = ufl.sym(U)
+    coupled = nu[0] * (strain[0, 0] - strain[1, 1]) + 2 * nu[1] * strain[0, 1]
+    return (0.5 * ufl.tr(strain) ** 2 + ufl.inner(strain, strain) + 0.2 * ufl.inner(N, N)
+            + 0.5 * ufl.inner(nu, nu) + 0.3 * coupled)  # fmt: skip
+
+
 def test_plot(tmp_path):
     """Branches are followed through crossings; three panels, written to a file."""
     body, q = forms.microcracked(c1=0.0, c2=0.0, k3=0.0, k3_sym=0.0), np.linspace(0, 4, 60)
@@ -319,6 +327,13 @@ def test_plot(tmp_path):
     assert abs(np.diff(followed, 2, axis=0)).max() < 0.02
     np.testing.assert_allclose(np.sort_complex(followed[7]),
                                np.sort_complex(body.dispersion((0, 0, q[7]))))  # fmt: skip
+    # Phase speeds hardly change in the first steps, where no slope is known: no branch is another.
+    lossy = cb.Body(2, squares, 1.0, 0.5, np.diag([0.05, 0.4]))
+    q0 = np.linspace(0.05, 20, 100)
+    speeds = branches(lossy, (1.0,), q0).real / q0[:, None]
+    assert np.abs(np.diff(speeds[:4], axis=0)[:, 5:8]).max() < 0.02
+    decay = cb.plot_dispersion(lossy, q0)[1]
+    assert min(np.nanmin(line.get_ydata(), initial=1.0) for line in decay.lines) > 1e-9
     axes = cb.plot_dispersion(body, q, (0, 0, 2), tmp_path / "new" / "waves.png")
     assert (tmp_path / "new" / "waves.png").stat().st_size > 10_000
     assert [ax.get_xlabel() for ax in axes] == ["wave number q [1/m]"] * 3
