@@ -167,7 +167,8 @@ def test_other_numbers_of_ranks(comm, shared_path, case):
     assert np.array_equal(np.sort(numbers), np.arange(len(numbers)))
 
     def same(result, ranks):
-        assert result.stats.updates == pytest.approx(reference.stats.updates, rel=0.01)
+        if case != "newmark":  # whose linear solver takes more iterations on more ranks
+            assert result.stats.updates == pytest.approx(reference.stats.updates, rel=0.01)
         for name in FIELDS:
             numbers, known = by_number(getattr(reference, name))
             expected = np.empty_like(known)
