@@ -30,6 +30,7 @@ from mpi4py import MPI
 
 from complexbody.asked import Accuracy, Parting
 from complexbody.candidates import candidates, halved, name_of, scaled
+from complexbody.corners import BEND, widest
 from complexbody.errors import AccuracyError
 from complexbody.given import is_positive, short
 from complexbody.histories import Constant
@@ -59,6 +60,8 @@ KEEP = 1.5
 DOUBT, DOUBT_LATE = (1.5, 1.0), (8.0, 2.0, 1.0)
 #: Below this share of the request one window of the run is enough.
 CLEAR = 0.5
+#: At re-entrant corners the mesh's error is at most so many times its estimate (docs/plan.md).
+CORNERS = 3.0
 #: Share of the request that the advised mesh leaves to its own error.
 ROOM = 0.7
 #: Loads act from where they reach this part of their largest factor.
@@ -350,6 +353,16 @@ class Accurate:
             verified + mesh <= self.asked, self.tried, self.work / max(result.stats.updates, 1),
             spent / max(result.stats.stepping, 1e-12), self.restarts,
         )  # fmt: skip
+        angle = widest(self.pilots.problem)
+        if made.met and angle > BEND and verified + CORNERS * mesh > self.asked:
+            if self.comm.rank == 0:
+                warnings.warn(
+                    f"The body has a corner or edge whose interior angle is {angle:.2g} times a "
+                    "flat one. Of the singular fields there the estimate of the mesh's error, "
+                    f"{mesh:.2g}, sees a part: the run's error may be up to "
+                    f"{verified + CORNERS * mesh:.2g}, more than the {self.asked:g} asked for. "
+                    "Compare with a finer mesh.", UserWarning, stacklevel=3,
+                )  # fmt: skip
         if not made.met and self.comm.rank == 0:
             warnings.warn(
                 f"The run's error is about {verified + mesh:.2g} ({verified:.2g} in time, "
