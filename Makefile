@@ -48,22 +48,22 @@ charts: setup ## speed against accuracy on four scenes (docs/charts), serially, 
 	$(call CHART,plate) $(PLATE) --steps 4 --budget 15
 
 # One half of the serial tests; the other takes what is left, in about the same time.
-HALF := $(wildcard tests/test_*.py tests/verification/test_windows*.py) tests/forms tests/kernels \
+HALF := $(wildcard tests/test_[a-q]*.py tests/verification/test_windows*.py) tests/forms tests/kernels \
     tests/verification/where_methods_fail
 
 # On a new machine compiling takes longer than the few steps of a test: it is told to hurry.
 test: export COMPLEXBODY_OPTIMISATION := -O1
-# All are run, whichever fails: serially in two halves at once; on 2 and 3 ranks what is about ranks
-# with a ninth and an eighteenth of the rest (make verify: all of it).
+# All are run, whichever fails: serially in two halves at once; on 2 ranks what is about ranks and
+# a 16th of the rest, on 3 half of that (make verify: all of it).
 test: setup ## all but the slow tests: serially, on 2 and on 3 ranks
 	@status=0; mkdir -p build/test-tmp/half; set -x; \
 	PYTEST_DEBUG_TEMPROOT=build/test-tmp/half $(PYTEST) -p no:cacheprovider --color=no \
 	    -m "not slow" $(HALF) >build/half.log 2>&1 & half=$$!; \
 	$(PYTEST) -m "not slow" $(HALF:%=--ignore=%) || status=1; \
 	wait $$half || status=1; cat build/half.log; \
-	timeout -k 10 900 $(MPIRUN) -n 2 $(MPI_PYTEST) -m "not serial and not slow" --sample 9 \
+	timeout -k 10 900 $(MPIRUN) -n 2 $(MPI_PYTEST) -m "not serial and not slow" --sample 16 \
 	    || status=1; \
-	timeout -k 10 900 $(MPIRUN) -n 3 $(MPI_PYTEST) -m "not serial and not slow" --sample 18 \
+	timeout -k 10 900 $(MPIRUN) -n 3 $(MPI_PYTEST) -m "not serial and not slow" --sample 32 --about 2 \
 	    || status=1; \
 	exit $$status
 

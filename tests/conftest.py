@@ -79,17 +79,19 @@ def pytest_configure(config):
 
 
 def pytest_addoption(parser):
-    """``--sample N``: tests about ranks, and one of N of the others, the same ones every time."""
+    """``--sample N``: one of N tests, ``--about N``: of those about ranks; the same every time."""
     parser.addoption("--sample", type=int, default=1, metavar="N", help="run one of N tests")
+    parser.addoption("--about", type=int, default=1, metavar="N", help="of those about ranks")
 
 
 def pytest_collection_modifyitems(config, items):
     """Leave `serial` tests out under mpirun, and what is not in the sample."""
-    part = config.getoption("--sample")
-    if part > 1:
+    part, about = config.getoption("--sample"), config.getoption("--about")
+    if max(part, about) > 1:
+        parts = [about if "rank" in item.nodeid else part for item in items]
         chosen = [
-            item for item in items
-            if "rank" in item.nodeid or zlib.crc32(item.nodeid.encode()) % part == 0
+            item for item, part in zip(items, parts, strict=True)
+            if zlib.crc32(item.nodeid.encode()) % part == 0
         ]  # fmt: skip
         config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
         items[:] = chosen

@@ -27,7 +27,7 @@ from complexbody.errors import ComplexBodyError
 #: Seconds that one case may take, compiling included.
 LIMIT = 60.0
 #: Examples of each test in CI, and in `make verify`.
-FEW, MANY = 30, 420
+FEW, MANY = 20, 420
 
 _verdicts = MPI.COMM_WORLD.Dup()
 

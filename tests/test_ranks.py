@@ -43,6 +43,7 @@ def run(comm, case, folder, dim=3, scene=None):
     return cb.simulate(scene, method, until=until, output=output, ledger_steps=4)
 
 
+@pytest.mark.skipif(MPI.COMM_WORLD.size == 1, reason="one rank is one rank")
 @pytest.mark.parametrize("dim", [1, 2, 3])
 @pytest.mark.parametrize("case", CASES)
 def test_one_rank_or_more(comm, shared_path, tmp_path, case, dim):
