@@ -48,8 +48,7 @@ charts: setup ## speed against accuracy on four scenes (docs/charts), serially, 
 	$(call CHART,plate) $(PLATE) --steps 4 --budget 15
 
 # One half of the serial tests; the other takes what is left, in about the same time.
-HALF := $(wildcard tests/test_[a-q]*.py tests/verification/test_windows*.py) tests/forms tests/kernels \
-    tests/verification/where_methods_fail
+HALF := $(wildcard tests/test_[a-q]*.py tests/verification/test_windows*.py) tests/forms tests/kernels
 
 # On a new machine compiling takes longer than the few steps of a test: it is told to hurry.
 test: export COMPLEXBODY_OPTIMISATION := -O1
