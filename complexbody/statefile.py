@@ -26,7 +26,7 @@ from complexbody.files import settle
 Array = npt.NDArray[Any]
 
 #: Changes when older files can no longer be read.
-FORMAT = 1
+FORMAT = 2
 _ABOUT, _DIGEST = "about.json", 64
 _NAME = re.compile(r"step-(\d+)\.npz")
 
@@ -104,13 +104,15 @@ def read(path: Path) -> tuple[dict[str, Any], Mapping[str, Array]]:
     try:
         with zipfile.ZipFile(path) as archive:
             about = json.loads(archive.read(_ABOUT))
-        made = about["format"]
+        made, versions = about["format"], about.get("versions")
     except (zipfile.BadZipFile, OSError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path} is no checkpoint ({error!r}). Use another one.") from error
     if made != FORMAT:
+        known = isinstance(versions, dict)
+        writer = versions.get("complexbody", "unknown") if known else "unknown"
         raise CheckpointError(
             f"{path} has format {made}, and this version reads {FORMAT}. Use the "
-            f"version that wrote it ({about.get('versions', {}).get('complexbody', 'unknown')})."
+            f"version that wrote it ({writer})."
         )
     return about, Arrays(path)
 

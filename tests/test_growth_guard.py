@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: LGPL-3.0-or-later
 """The guard on energy from nowhere: silent where little is put in, not where runs blow up."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,10 @@ import ufl
 from harness import refused
 
 import complexbody as cb
-from complexbody import meshes
+from complexbody import forms, meshes
 from complexbody.errors import DivergenceError
+from complexbody.ledger import Bookkeeper
+from complexbody.problem import Problem
 
 LEFT = lambda x: x[0] < 1e-9  # noqa: E731
 
@@ -45,6 +48,21 @@ METHODS = {
     "order 1": (cb.Implicit(order=1), growing), "order 2": (cb.Implicit(), growing),
     "split": (cb.Implicit(forces="implicit"), 1.0),
 }  # fmt: skip
+
+
+def test_what_was_put_in_is_known_after_a_checkpoint(comm):
+    """All that the guard's bound depends on goes through a checkpoint, χ(ν, 0) at the start too."""
+    problem = Problem(cb.Scene(meshes.interval(comm, 0.0, 1.0, 4), forms.isotropic_two_field(d=1)))
+    run = cb.Synchronous().prepare(problem, 1.0)
+    books, later = (Bookkeeper(problem, run) for _ in range(2))
+    books.row()
+    books._put, books._still, books._size = 3.0, (-2.0, -2.0), 5.0
+    later.restore(json.loads(json.dumps(books.state())), np.array(books.ledger.rows))
+    assert later.state() == books.state() and later.state()["still"] == -2.0
+    later._still = later._still[0], -7.0  # as a later row finds it
+    assert later._bound() == 5.0
+    run.close()
+    problem.close()
 
 
 @pytest.mark.parametrize("name", METHODS)

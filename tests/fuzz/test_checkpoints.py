@@ -182,7 +182,8 @@ def test_no_archive_with_a_good_checksum(comm, case, shared_path):
         comm.barrier()
         return path
 
-    for text in (None, "", "[]", "3", "{", json.dumps({"format": 1})):
+    forged = [{"format": statefile.FORMAT}, {"format": 1}, {"format": None, "versions": 3}]
+    for text in (None, "", "[]", "3", "{", *map(json.dumps, forged)):
         told(going_on(comm, case, sealed(text)))
 
 
